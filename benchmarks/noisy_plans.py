@@ -12,8 +12,8 @@ from collections.abc import Iterator
 import numpy as np
 
 import varpin as vp
-from varpin.control.moments import noise_cost
-from varpin.control.spread import Feedback
+from varpin.control.noise import noise_cost
+from varpin.control.stages import Feedback, Steps
 
 PATHS = 2000
 ARMS = {
@@ -79,8 +79,8 @@ def long_steps() -> None:
                 noisy = reach(name, robot, vp.ControlNoise(0.03), dt=dt, damping=damping, speed=1.0)
                 feedback = Feedback(plan.gains, plan.previous_gains)
                 fine = noisy.at(dt=dt / 16, hold=16)
-                there = noise_cost(fine, fine.simulate(np.repeat(plan.controls, 16, axis=0)), feedback)
-                found.append(f"{noise_cost(noisy, noisy.simulate(plan.controls), feedback) / there - 1.0:+.1%}")
+                there = noise_cost(Steps(fine, fine.simulate(np.repeat(plan.controls, 16, axis=0))), feedback)
+                found.append(f"{noise_cost(Steps(noisy, noisy.simulate(plan.controls)), feedback) / there - 1.0:+.1%}")
         print(f"| {name} | {' | '.join(found)} |", flush=True)
 
 

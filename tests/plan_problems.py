@@ -152,6 +152,7 @@ SMALL: dict[str, Case] = {
         within=1e-4,
     ),
     "linear": Case(lambda: reach(controls="linear"), 2.1082305, scipy=True),
+    "linear, second order": Case(lambda: reach(controls="linear"), 2.1082305, options={"second_order": True}),
     "linear, torques": Case(lambda: reach(controls="linear", **LIMITS), 2.7921344, scipy=True),
     "linear, rates and goal": Case(lambda: reach(tip(), vp.WithinControlRate(120.0), controls="linear"), 208.02676),
     "linear, change of controls": Case(
@@ -185,6 +186,7 @@ SMALL: dict[str, Case] = {
     "three links, speeds": Case(lambda: wave(vp.WithinVelocityLimits(THREE, (-0.9, 0.9))), 2.6048773),
     "servos at their limits": Case(served, 0.0035311108, kkt=1e-4),
     "closed loop": Case(loop, 5.2016894),
+    "closed loop, second order": Case(loop, 5.2016894, options={"second_order": True}),
     "from states": Case(lambda: reach(speeds(1.8)), 3.5426741, options={"states": LINE}),
     "second order": Case(lambda: reach(integrator=vp.Midpoint(), **LIMITS), 3.0291445, options={"second_order": True}),
     "explicit steps": Case(lambda: reach(speeds(1.8), integrator=vp.RungeKutta4()), 3.5426051, scipy=True),

@@ -8,8 +8,7 @@ from findings import about
 
 import varpin as vp
 from varpin import core
-from varpin.control.passes import TRUSTED
-from varpin.control.square_root import squares_of
+from varpin.control.riccati import TRUSTED, squares_of
 
 INERTIAS = {"unit": np.ones(3), "finger": np.array([1e-5, 1e-6, 1e-7]), "mixed": np.array([1.0, 1e-3, 1e-6])}
 EXTREMES = (1e-9, 1.0, 1e9)

@@ -95,17 +95,3 @@ def test_a_step_in_parts_is_chained():
     slope = first({k: gradient(k) for k in range(-4, 5)})
     H = vp.second_order(scene, motion, z).xx[0]
     np.testing.assert_allclose(H @ np.append(np.zeros(4), M @ along), slope, atol=1e-7 * np.abs(slope).max())
-
-
-def test_full_differential_dynamic_programming_of_a_five_bar():
-    drives = np.zeros((4, 2))
-    drives[0, 0] = drives[3, 1] = 1.0
-    scene, q0, _ = five_bar(actuation=drives)
-    goal = vp.assemble(scene, q0 + np.array([0.6, 0.0, 0.0, 0.0]))
-    cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost(goal, 1e3) + vp.VelocityCost(10.0))
-    problem = vp.OptimalControlProblem(scene, cost, q0, np.zeros(4), dt=0.04, steps=12)
-    plain = vp.solve(problem, tolerance=1e-10, max_iterations=200, check=False)
-    full = vp.solve(problem, tolerance=1e-10, max_iterations=200, second_order=True, check=False)
-    assert full.status is plain.status is vp.Status.CONVERGED
-    assert full.cost == pytest.approx(plain.cost, rel=1e-9)
-    assert full.iterations <= plain.iterations

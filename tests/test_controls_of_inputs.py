@@ -54,26 +54,6 @@ def truth():
     return solve_ivp(slope, (0.0, SPAN), np.append(Q0, V0), "DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
 
 
-@pytest.mark.parametrize("vectorized", [False, True])
-@pytest.mark.parametrize(
-    ("interpolation", "method", "order"), [("linear", vp.Midpoint(), 2), ("cubic", vp.Gauss(2), 4)]
-)
-def test_a_function_of_time_moves_an_input_and_drives_a_motor(interpolation, method, order, vectorized):
-    scene = arm(interpolation)
-    controls = vp.OpenLoop(
-        (lambda t: np.array([wanted(scene, x) for x in t])) if vectorized else lambda t: wanted(scene, t), vectorized
-    )
-    errors = []
-    for steps in (40, 80):
-        motion = vp.simulate(scene, Q0, V0, dt=SPAN / steps, steps=steps, controls=controls, integrator=method)
-        np.testing.assert_allclose(motion.q[1:, 0], path(motion.t[1:]), atol=1e-14)
-        np.testing.assert_array_equal(motion.u[:, 0], path(motion.t[1:]))
-        errors.append(np.abs(motion.q[-1] - truth()[:3]).max())
-        assert not motion.warnings
-    assert abs(np.log2(errors[0] / errors[1]) - order) < 0.3
-    assert errors[1] < (2e-3 if order == 2 else 2e-6)
-
-
 def test_a_motion_under_a_function_of_time_is_linearized():
     """Against differences in the position and the velocity at the end of the step, and in a force held over it."""
     scene = arm("cubic")
@@ -91,23 +71,6 @@ def test_a_motion_under_a_function_of_time_is_linearized():
             ends = [step(begin + s * k * e) for s in (1, -1)]
             slope += w / size * (np.append(ends[0].q[1], ends[0].p[1]) - np.append(ends[1].q[1], ends[1].p[1]))
         np.testing.assert_allclose(lin.B[0, :, c], slope, atol=1e-8 * np.abs(lin.B[0]).max())
-
-
-@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
-@pytest.mark.parametrize("method", [vp.Midpoint(), vp.Gauss(2)])
-def test_lines_between_nodes(interpolation, method):
-    """The positions are those of rows; forces change within the step where the method follows them."""
-    scene = arm(interpolation)
-    t = np.linspace(0.0, SPAN, 81)
-    nodes = np.array([wanted(scene, x) for x in t])
-    motion = vp.simulate(scene, Q0, V0, dt=0.01, steps=80, controls=vp.FirstOrderHold(nodes), integrator=method)
-    np.testing.assert_allclose(motion.q[:, 0], path(t), atol=1e-14)
-    np.testing.assert_array_equal(motion.u[:, 0], nodes[1:, 0])
-    assert np.abs(motion.q[-1] - truth()[:3]).max() < 1e-3
-    nodes[:, 1] = 0.7
-    still = vp.simulate(scene, Q0, V0, dt=0.01, steps=80, controls=vp.FirstOrderHold(nodes), integrator=method)
-    rows = vp.simulate(scene, Q0, V0, dt=0.01, steps=80, controls=nodes[1:], integrator=method)
-    np.testing.assert_allclose(still.q, rows.q, atol=1e-13)
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])

@@ -7,7 +7,7 @@ import pytest
 from refusals import refused
 
 from varpin import core
-from varpin.control.square_root import squares_of
+from varpin.control.riccati import squares_of
 
 H = 0.1  # the step
 OPTIONS = [{}, {"rated": True}, {"velocity": False, "samples": 1}, {"within": True}, {"rated": True, "held": True}]

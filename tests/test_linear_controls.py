@@ -62,37 +62,6 @@ def test_feedback_is_that_of_the_optimum_from_another_state() -> None:
     assert fed - best.cost < 0.05 * (alone - best.cost)
 
 
-def test_a_finer_grid_follows_the_same_line() -> None:
-    problem = links()
-    plan = vp.solve(problem, check=False)
-    fine = vp.simulate(
-        problem.scene, problem.q0, problem.v0, dt=problem.dt / 4, steps=4 * N, controls=plan.policy.without_feedback()
-    )
-    share = np.arange(4)[:, None] / 4
-    u = plan.controls
-    between = ((1.0 - share) * u[:-1, None] + share * u[1:, None]).reshape(-1, 2)
-    np.testing.assert_allclose(fine.u_nodes[:-1], between, atol=1e-12)
-    np.testing.assert_allclose(fine.u, 0.5 * (fine.u_nodes[1:] + fine.u_nodes[:-1]), atol=1e-12)
-    told = plan.verify()
-    assert abs(told.open_loop_loss) < 1e-3
-    assert abs(told.closed_loop_loss) < 1e-3
-    assert told.defect < 1e-4
-
-
-def test_half_the_nodes_do() -> None:
-    """What held controls reach to a thousandth takes fewer than half as many nodes with linear ones."""
-    best = vp.solve(links(dt=0.01, steps=80), check=False).cost
-
-    def nodes(controls: str) -> int:
-        for steps in (2, 3, 4, 6, 8, 12, 16, 24, 32, 48):
-            plan = vp.solve(links(dt=0.8 / steps, steps=steps, controls=controls), check=False)
-            if abs(plan.verify(tolerance=1e-6).open_loop_cost / best - 1.0) < 1e-3:
-                return steps
-        return 1000
-
-    assert 2 * nodes("linear") <= nodes("held")
-
-
 def test_refusals() -> None:
     with refused(vp.InputError, "controls", "'held'", "'linear'"):
         links(controls="cubic")
@@ -121,21 +90,3 @@ def test_links_too_light_for_the_plain_pass() -> None:
     plan = vp.solve(problem, max_iterations=3, check=False)
     assert plan.cost < plan.history[0].cost or plan.status.converged
     assert np.isfinite(plan.gains).all()
-
-
-def test_advice_is_one_that_such_problems_take() -> None:
-    """Finer steps, but none that a control is held over."""
-    plan = vp.solve(links(integrator=vp.SemiImplicitEuler()))
-    (advice,) = [sentence for sentence in plan.warnings if "problem.at(" in sentence]
-    assert "problem.at(dt=0.025) " in advice
-    assert plan.problem.at(dt=0.025).linear
-
-
-def test_second_order_converges_in_fewer_iterations() -> None:
-    end = vp.TrackingCost([3.0, 0.0], 1e3) + vp.VelocityCost(1e2)
-    cost = vp.ControlCost(1e-3) + vp.Terminal(end)
-    problem = links(cost=cost, integrator=vp.Gauss(2), steps=20, dt=0.08)
-    plain, newton = (vp.solve(problem, second_order=way, tolerance=1e-13, check=False) for way in (False, True))
-    assert newton.status.converged
-    assert len(newton.history) < len(plain.history)
-    assert newton.cost <= plain.cost * (1.0 + 1e-9)

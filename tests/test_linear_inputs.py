@@ -54,28 +54,6 @@ def test_the_gradient_is_that_of_the_cost(interpolation: str, second_order: bool
     np.testing.assert_allclose(plan.gradient, found, atol=1e-6 * np.abs(found).max())
 
 
-@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
-def test_a_plan_is_the_optimum_and_holds_between_nodes(interpolation: str) -> None:
-    problem = hand_and_motor(interpolation, steps=16, dt=0.03, integrator=vp.Gauss(3))
-    plan = vp.solve(problem, tolerance=1e-13, check=False)
-    assert plan.status.converged
-    np.testing.assert_allclose(plan.controls[:, 0], plan.trajectory.q[:, 0], atol=1e-12)
-    again = vp.simulate(
-        problem.scene, problem.q0, problem.v0, dt=problem.dt, steps=problem.steps, integrator=problem.integrator,
-        controls=vp.FirstOrderHold(plan.controls),
-    )  # fmt: skip
-    np.testing.assert_allclose(again.q, plan.trajectory.q, atol=1e-10)
-    np.testing.assert_allclose(problem.simulate(plan.policy).u_nodes, plan.controls, atol=1e-9)
-    rng = np.random.default_rng(1)
-    for _ in range(3):
-        other = plan.controls + 1e-2 * rng.normal(size=plan.controls.shape)
-        other[0] = plan.controls[0]
-        assert problem.cost_of(problem.simulate(line(problem, other))) > plan.cost
-    told = plan.verify(tolerance=1e-6)
-    assert abs(told.closed_loop_loss) < 5e-3
-    assert abs(told.open_loop_loss) < 5e-3
-
-
 def test_paths_cost_what_the_plan_expects() -> None:
     problem = hand_and_motor(noise=vp.ControlNoise(0.05) + vp.AdditiveNoise(0.01))
     plan = vp.solve(problem, check=False)
@@ -149,16 +127,6 @@ def test_noise_in_python_is_that_of_the_core(interpolation: str, kick: str) -> N
         found, expected = (vp.linearize(problem.scene, motion) for problem, motion in ((python, other), (core, one)))
         for name in ("A", "G", "Gx", "Gu"):
             np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-10)
-
-
-@pytest.mark.parametrize("controls", ["held", "linear"])
-def test_plans_under_noise_in_python_are_those_under_the_same_in_the_core(controls: str) -> None:
-    one, other = (vp.solve(problem, check=False) for problem in noisy_pair("cubic", controls=controls))
-    assert other.status.converged
-    assert other.noise_cost == pytest.approx(one.noise_cost, rel=1e-6)
-    assert other.cost == pytest.approx(one.cost, rel=1e-8)
-    told = other.monte_carlo(8, rng=0)
-    assert told.cost == pytest.approx(one.monte_carlo(8, rng=0).cost, rel=1e-5)
 
 
 def test_noise_of_the_position_of_an_input_is_differentiated_at_the_end_of_the_step() -> None:

@@ -5,10 +5,9 @@ import pytest
 from findings import about
 
 import varpin as vp
-from varpin.control.along import Along
-from varpin.control.moments import left_within_steps, noise_cost, noise_cost_in_halves
-from varpin.control.passes import single_pass
-from varpin.control.spread import Feedback, covariances
+from varpin.control.noise import covariances, left_within_steps, noise_cost
+from varpin.control.riccati import backward
+from varpin.control.stages import Feedback, Steps
 from varpin.integrators.base import diffusion_and_drift
 
 CONTROL, STATE = vp.ControlNoise(0.3), vp.StateNoise(3.0, center=np.zeros(2))
@@ -42,10 +41,11 @@ def test_the_noise_cost_is_that_of_the_covariance(noise: object, kick: str) -> N
     weight = 1e-3
     problem = reach(noise, integrator=vp.Gauss(2, kick=kick), rate=weight)
     motion = problem.simulate(line(problem, np.random.default_rng(1).normal(size=(problem.decisions, 2))))
-    plan, _ = single_pass(Along(problem, motion), 0.0)
+    steps = Steps(problem, motion)
+    plan = backward(steps, 0.0)
     feedback = Feedback(plan.feedback, plan.previous)
     lin, C, changes, x = vp.linearize(problem.scene, motion), np.zeros((6, 6)), 0.0, 4
-    nodes = covariances(problem, motion, feedback)
+    nodes = covariances(steps, feedback)
     for k in range(problem.steps):
         np.testing.assert_allclose(nodes[k], C[:x, :x], atol=1e-12)
         K = np.hstack([plan.feedback[k + 1], plan.previous[k + 1]])
@@ -59,7 +59,7 @@ def test_the_noise_cost_is_that_of_the_covariance(noise: object, kick: str) -> N
         for i in range(lin.G.shape[2]):
             D = np.hstack([lin.Gx[k, :, i], lin.Gu[k, :, i] - lin.Gramp[k, :, i], lin.Gramp[k, :, i]])
             C[:x, :x] += problem.dt * (np.outer(lin.G[k, :, i], lin.G[k, :, i]) + D @ Z @ D.T)
-    assert plan.noise == pytest.approx(noise_cost(problem, motion, feedback) + changes, rel=1e-10)
+    assert plan.noise == pytest.approx(noise_cost(steps, feedback) + changes, rel=1e-10)
 
 
 @pytest.mark.parametrize("noise", [CONTROL + STATE, SLIDING], ids=["core", "python"])
@@ -110,7 +110,7 @@ def test_paths_cost_what_the_plan_expects(noise: object, integrator: vp.Integrat
     children = np.random.default_rng(0).spawn(2)
     again = [problem.cost_of(problem.simulate(plan.policy, rng=child)) for child in children]
     first = plan.monte_carlo(2, rng=0)
-    within = left_within_steps(problem, plan.trajectory, Feedback(plan.gains, plan.previous_gains))
+    within = left_within_steps(Steps(problem, plan.trajectory), Feedback(plan.gains, plan.previous_gains))
     assert (within > 0.0) == integrator.holds_noise
     assert first.cost == pytest.approx(np.mean(again) + within, rel=1e-12)
 
@@ -124,21 +124,6 @@ def test_an_ensemble_stores_the_controls_of_lines() -> None:
         alone = problem.simulate(plan.policy, rng=child)
         np.testing.assert_allclose(paths.q[path], alone.q, atol=1e-13)
         np.testing.assert_allclose(paths.u[path], alone.u, atol=1e-12)
-
-
-def test_lines_over_several_steps_with_fields_in_python() -> None:
-    """Noise that Python evaluates takes lines over several steps as the core does."""
-    problem = reach(vp.AdditiveNoise(0.1), integrator=vp.Gauss(2))
-    plan = vp.solve(problem, check=False)
-    fields = vp.CustomNoise(lambda q, v, u: np.array([[0.2], [1.0]]), 1)
-    own = vp.Scene(vp.planar_chain(2), damping=0.2, noise=fields)
-    given = {"dt": problem.dt / 4, "steps": 4 * problem.steps, "controls": plan.policy, "increments": 0.0}
-    fine = [
-        vp.simulate(scene, problem.q0, problem.v0, integrator=problem.integrator, check=False, **given)
-        for scene in (problem.scene, own)
-    ]
-    np.testing.assert_allclose(fine[0].u_nodes, fine[1].u_nodes, atol=1e-12)
-    np.testing.assert_allclose(fine[0].q, fine[1].q, atol=1e-12)
 
 
 @pytest.mark.parametrize("rate", [0.0, 1e-2])
@@ -164,7 +149,7 @@ def test_the_noise_cost_in_halves_is_that_of_each_impulse(rate: float) -> None:
     least, expected = halves.cost_of(still), 0.0
     for w in np.eye(16)[:, :, None]:
         expected += 0.05 * 0.5 * (halves.cost_of(motion(w)) + halves.cost_of(motion(-w)) - 2.0 * least)
-    found = noise_cost_in_halves(problem, halves, still, Feedback(plan.gains, plan.previous_gains))
+    found = noise_cost(Steps(halves, still), Feedback(plan.gains, plan.previous_gains), halves=True)
     assert found == pytest.approx(expected, rel=1e-9)
 
 

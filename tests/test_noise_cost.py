@@ -7,10 +7,9 @@ from findings import about
 from scipy.linalg import expm
 
 import varpin as vp
-from varpin.control.moments import noise_cost
-from varpin.control.spread import Feedback
-from varpin.control.within_steps import beyond_samples, mean_of_decay
-from varpin.linearization import linearize_steps
+from varpin.control.noise import noise_cost
+from varpin.control.samples import means_of_decay
+from varpin.control.stages import Feedback, Steps
 
 LEVEL, DAMPING = 0.3, 1.5
 WEIGHTS = {"q": 5.0, "v": 1.0, "u": 0.05}
@@ -64,7 +63,7 @@ def test_it_is_that_of_the_backward_pass(noise, kick):
         integrator=vp.Gauss(2, kick=kick),
     )  # fmt: skip
     found = vp.solve(problem, check=False)
-    own = noise_cost(problem, found.trajectory, Feedback(found.gains, found.previous_gains))
+    own = noise_cost(Steps(problem, found.trajectory), Feedback(found.gains, found.previous_gains))
     assert own == pytest.approx(found.noise_cost, rel=1e-9)
 
 
@@ -104,11 +103,11 @@ def test_in_the_long_steps_of_a_plan_it_is_close_to_that_of_fine_steps(damping):
     found = vp.solve(vp.OptimalControlProblem(scene, cost, [0.3, 0.1], [0.0, 0.0], dt=0.04, steps=25), check=False)
     feedback = Feedback(found.gains, found.previous_gains)
     fine = found.problem.at(dt=0.04 / 16, hold=16)
-    there = noise_cost(fine, fine.simulate(np.repeat(found.trajectory.u, 16, axis=0)), feedback)
+    there = noise_cost(Steps(fine, fine.simulate(np.repeat(found.trajectory.u, 16, axis=0))), feedback)
     assert found.problem.integrator.kick == "held"
     assert found.noise_cost == pytest.approx(there, rel=0.05)
     left = found.problem.at(integrator=type(found.problem.integrator)(stages=4))
-    assert noise_cost(left, left.simulate(found.trajectory.u), feedback) > 1.02 * there
+    assert noise_cost(Steps(left, left.simulate(found.trajectory.u)), feedback) > 1.02 * there
 
 
 @pytest.mark.parametrize("damping", [0.05, 1.5, 30.0])
@@ -120,7 +119,7 @@ def test_what_velocities_cost_within_steps(damping):
     problem = vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=dt, steps=1)
     motion = problem.simulate(np.zeros((1, 1)))
     still = Feedback(np.zeros((1, 1, 2)), None)
-    found = noise_cost(problem, motion, still)
+    found = noise_cost(Steps(problem, motion), still)
     inertia = vp.lagrangian_jet(scene, [0.0], [0.0]).Lvv[0, 0]
     rate = damping / inertia
     variance = (level / inertia) ** 2 / (2.0 * rate)
@@ -134,7 +133,7 @@ def test_the_mean_of_what_decays_within_a_step(size):
     Z = size * np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 0.3], [0.0, 0.0, 2.0]])
     root = np.random.default_rng(0).normal(size=(3, 3))
     H = root.T @ root
-    found = mean_of_decay(Z[None], H[None])[0]
+    found = means_of_decay(Z[None], H[None])[0][0]
     # d/ds of exp(-Z s)' H exp(-Z s) is linear in it; the integral is the last block of the exponential of a chain.
     rates = np.zeros((27, 27))
     rates[:9, :9] = -(np.kron(Z.T, np.eye(3)) + np.kron(np.eye(3), Z.T))
@@ -156,7 +155,7 @@ def test_feedback_as_fast_as_the_steps_is_told_of_where_noise_matters(strength, 
     found = vp.solve(vp.OptimalControlProblem(scene, cost, **start, dt=4e-3, steps=50))
     in_halves = found.problem.at(dt=2e-3, hold=2, integrator=found.problem.integrator)
     finer = in_halves.simulate(found.policy_on("momentum", 2))
-    halves = noise_cost(in_halves, finer, Feedback(found.gains, found.previous_gains))
+    halves = noise_cost(Steps(in_halves, finer), Feedback(found.gains, found.previous_gains))
     assert abs(halves - found.noise_cost) > 0.1 * halves
     assert abs(halves - found.noise_cost) < 0.05 * (found.cost + halves)
     assert (halves > 0.01 * (found.cost + halves)) == told
@@ -175,11 +174,10 @@ def test_steps_in_which_noise_grows_without_bound_have_no_cost(recwarn):
 
     damped = problem()
     motion = damped.simulate(np.zeros((4, 2)))
-    lin = linearize_steps(damped.scene, motion, damped.integrator, damped.q0)
-    hessian = damped.expand_running(motion).hessian
-    driven = problem(vp.CustomForce(lambda q, v: 1e5 * v))
+    driven = Steps(problem(vp.CustomForce(lambda q, v: 1e5 * v)), motion)
+    vars(driven)["lin"] = Steps(damped, motion).lin
     with pytest.raises(vp.LinearizationError, match="without bound"):
-        beyond_samples(driven, motion, lin, hessian, len(driven.rule), None)
+        driven.kicked  # noqa: B018 - made as it is read
     assert not recwarn.list
 
 
@@ -197,9 +195,9 @@ def test_in_fast_motions_of_arms_it_is_that_of_fine_steps(damping):
     plan = vp.solve(problem(None), check=False)
     noisy, feedback = problem(vp.ControlNoise(0.05)), Feedback(plan.gains, plan.previous_gains)
     fine = noisy.at(dt=0.05 / 16, hold=16)
-    there = noise_cost(fine, fine.simulate(np.repeat(plan.controls, 16, axis=0)), feedback)
+    there = noise_cost(Steps(fine, fine.simulate(np.repeat(plan.controls, 16, axis=0))), feedback)
     assert noisy.integrator.kick == "held"
-    assert noise_cost(noisy, plan.trajectory, feedback) == pytest.approx(there, rel=0.05)
+    assert noise_cost(Steps(noisy, plan.trajectory), feedback) == pytest.approx(there, rel=0.05)
 
 
 @pytest.mark.parametrize("integrator", [None, vp.Gauss(2, kick="held"), vp.Radau(3, kick="held")])
@@ -210,7 +208,7 @@ def test_what_the_last_step_leaves_of_the_last_velocity(damping, integrator):
     scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=damping, noise=vp.AdditiveNoise(level))
     cost = vp.ControlCost(1.0) + vp.Terminal(vp.VelocityCost(2.0))
     problem = vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=dt, steps=1, integrator=integrator)
-    found = noise_cost(problem, problem.simulate(np.zeros((1, 1))), Feedback(np.zeros((1, 1, 2)), None))
+    found = noise_cost(Steps(problem, problem.simulate(np.zeros((1, 1)))), Feedback(np.zeros((1, 1, 2)), None))
     inertia = vp.lagrangian_jet(scene, [0.0], [0.0]).Lvv[0, 0]
     rate = damping / inertia
     left = -np.expm1(-2.0 * rate * dt) / (2.0 * rate) if damping else dt

@@ -1,7 +1,6 @@
 """S-DDP against a plain Riccati recursion, scipy, differences of the rolled-out cost, and brute force."""
 
 import re
-import tracemalloc
 from itertools import pairwise
 
 import numpy as np
@@ -164,7 +163,7 @@ def test_riccati_with_multiplicative_noise(integrator):
 def test_line_search_is_on_the_expected_cost():
     """From the best motion without noise a whole step is taken, although the cost without noise rises."""
     problem = lq_problem(vp.Midpoint(), "midpoint", vp.ControlNoise(0.5))
-    plain = vp.solve(problem_without_noise(problem))
+    plain = vp.solve(lq_problem(vp.Midpoint(), "midpoint"))
     sol = vp.solve(problem, plain)
     assert sol.history[0].step == 1.0
     assert sol.history[0].cost > plain.cost * (1 + 1e-5)
@@ -177,43 +176,25 @@ def test_signal_dependent_noise_in_closed_form():
     p' = p + h u + c u dw, cost h (w v^2 + r u^2): P = a + P - h^2 P^2 / (rho + (h^2 + h c^2) P), a = 2 h w / m^2.
     """
     h, w, r, c = 0.05, 0.7, 0.2, 0.6
-    scene = vp.Scene(sliders(1), gravity=False, noise=vp.ControlNoise(c))
-    m = scene.robot.model.inertias[1].mass
-    cost = vp.VelocityCost(w) + vp.ControlCost(r)
-    problem = vp.OptimalControlProblem(scene, cost, [0.2], [0.9], dt=h, steps=1500, sampling="start")
-    sol = vp.solve(problem, tolerance=1e-12)
+    robot, cost = sliders(1), vp.VelocityCost(w) + vp.ControlCost(r)
+    m = robot.model.inertias[1].mass
+    sol, quiet = (
+        vp.solve(
+            vp.OptimalControlProblem(
+                vp.Scene(robot, gravity=False, noise=noise), cost, [0.2], [0.9], dt=h, steps=1500, sampling="start"
+            ),
+            tolerance=1e-12,
+        )
+        for noise in (vp.ControlNoise(c), None)
+    )
     a, rho, s = 2 * h * w / m**2, 2 * h * r, h**2 + h * c**2
     P = (a * s + np.sqrt((a * s) ** 2 + 4 * h**2 * a * rho)) / (2 * h**2)
     gain = -h * P / (rho + s * P)
     np.testing.assert_allclose(sol.gains[0, 0], [0.0, gain], rtol=0, atol=1e-10 * abs(gain))
     assert sol.expected_cost == pytest.approx(0.5 * P * (m * 0.9) ** 2, rel=1e-9)
     # The noise makes for a softer controller, and costs.
-    quiet = vp.solve(problem_without_noise(problem))
     assert abs(gain) < 0.95 * abs(quiet.gains[0, 0, 1])
     assert sol.noise_cost > 0.05 * sol.cost
-
-
-def problem_without_noise(problem):
-    scene = problem.scene
-    quiet = vp.Scene(
-        scene.robot,
-        gravity=scene.gravity,
-        damping=scene.damping,
-        stiffness=scene.stiffness,
-        rest=scene.rest,
-        actuation=scene.actuation,
-    )
-    return vp.OptimalControlProblem(
-        quiet,
-        problem.cost,
-        problem.q0,
-        problem.v0,
-        dt=problem.dt,
-        steps=problem.steps,
-        integrator=problem.integrator,
-        sampling=problem.sampling,
-        hold=problem.hold,
-    )
 
 
 def moved_cost(problem, controls):
@@ -396,44 +377,30 @@ def slopes(values, ratio):
     return [np.log(a / b) / np.log(ratio) for a, b in pairwise(moved)]
 
 
-@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4()], ids=str)
-def test_sampled_data_plans_converge_with_the_square_of_dt(integrator):
-    """Controls held over 40 ms, steps of 10 to 2.5 ms: everything that a user gets converges."""
+@pytest.mark.parametrize(
+    ("integrator", "sampling", "holds", "order"),
+    [
+        (vp.Midpoint(), "midpoint", (4, 8, 16), 1.9),
+        (vp.RungeKutta4(), "midpoint", (4, 8, 16), 1.9),
+        (vp.Midpoint(), "start", (8, 16, 32), 0.9),
+        (vp.RungeKutta4(), "gauss", (2, 4, 8), 3.7),
+    ],
+    ids=str,
+)
+def test_sampled_data_plans_converge_with_the_order_of_sampling(integrator, sampling, holds, order):
+    """Controls held over 40 ms in ever finer steps: everything that a user gets converges."""
     costs, controls, gains, late = [], [], [], []
-    for hold in (4, 8, 16):
-        sol = vp.solve(reach_problem(0.04 / hold, hold=hold, integrator=integrator), tolerance=1e-12)
+    for hold in holds:
+        sol = vp.solve(reach_problem(0.04 / hold, sampling, integrator, hold), tolerance=1e-14)
         found = sol.policy_on("velocity").gains
         costs.append(sol.cost)
         controls.append(sol.controls)
         gains.append(found[0])
         late.append(found[6])
-    for values in (costs, controls, gains, late):
-        assert min(slopes(values, 2)) > 1.9
-
-
-@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4()], ids=str)
-def test_sampling_at_the_start_is_of_first_order(integrator):
-    costs, controls = [], []
-    for hold in (4, 8, 16, 32):
-        problem = reach_problem(0.04 / hold, "start", hold=hold, integrator=integrator)
-        sol = vp.solve(problem, tolerance=1e-12)
-        costs.append(sol.cost)
-        controls.append(sol.controls)
-    assert slopes(costs, 2)[-1] == pytest.approx(1.0, abs=0.1)
-    assert slopes(controls, 2)[-1] == pytest.approx(1.0, abs=0.1)
-
-
-def test_gauss_points_are_of_fourth_order():
-    """With an integrator that is, for controls that are held."""
-    costs, controls, gains = [], [], []
-    for hold in (2, 4, 8):
-        problem = reach_problem(0.04 / hold, "gauss", hold=hold, integrator=vp.RungeKutta4())
-        sol = vp.solve(problem, tolerance=1e-14)
-        costs.append(sol.cost)
-        controls.append(sol.controls)
-        gains.append(sol.gains)
-    for values in (costs, controls, gains):
-        assert slopes(values, 2)[0] > 3.7
+    found = [slopes(values, 2)[0] for values in (costs, controls, gains, late)]
+    assert min(found) > order
+    # A left sum is of first order and no better.
+    assert sampling != "start" or max(found[:2]) < 1.1
 
 
 def test_iterations_do_not_depend_on_dt():
@@ -560,9 +527,8 @@ def test_warm_starts():
     problem = reach_problem(0.02)
     sol = vp.solve(problem, tolerance=1e-10)
     cold = sol.iterations
-    assert vp.solve(problem, sol.controls).iterations <= 1
-    assert vp.solve(problem, sol).iterations <= 1
-    assert vp.solve(problem, sol.policy).iterations <= 1
+    for start in (sol.controls, sol, sol.policy):
+        assert vp.solve(problem, start).iterations <= 1
     np.testing.assert_array_equal(vp.solve(problem, sol, max_iterations=0).trajectory.q, sol.trajectory.q)
     # From another state the policy is a better start than its controls.
     moved = problem.at(q0=problem.q0 + 0.05)
@@ -662,19 +628,6 @@ def test_the_same_problem_otherwise():
     rows = vp.TrackingCost(np.zeros((21, 2)))
     with refused(vp.InputError, "(41, 2)"):
         small(rows).at(dt=0.025)
-
-
-@pytest.mark.parametrize("noise", [None, vp.ControlNoise(0.05)], ids=["quiet", "noisy"])
-def test_memory(noise):
-    """Below 2 kB a node at three joints, of the search; the look at the plan has the record of four times as many."""
-    peaks = []
-    for steps in (50, 5000, 20000):
-        problem = arm_problem("finger", vp.Midpoint(), steps=steps, dt=1e-4, noise=noise)
-        tracemalloc.start()
-        vp.solve(problem, max_iterations=1, check=False)
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert (peaks[2] - peaks[1]) / 15000 < 2000.0
 
 
 def test_solutions_are_frozen():

@@ -8,7 +8,6 @@ import pytest
 from refusals import refused
 
 import varpin as vp
-from varpin import trajectory
 from varpin.core import Steps
 from varpin.signals.commands import open_loop
 from varpin.trajectory import chained
@@ -122,19 +121,6 @@ def test_derivatives_are_those_of_the_parts_taken(name, integrator, seed):
     np.testing.assert_array_equal(lin.K[k], lin.A[k][:, n:])
 
 
-@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Midpoint(alpha=0.3), vp.Gauss(2)], ids=str)
-@pytest.mark.parametrize("name", ARMS)
-def test_they_are_symplectic(name, integrator):
-    scene, motion = moving(name, integrator, 1, damping=0.0)
-    n = scene.robot.dof
-    J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(n))
-    assert motion.statistics.split_steps > 3
-    for k, A in enumerate(vp.linearize(scene, motion).A):
-        units = np.concatenate([np.ones(n), np.full(n, np.abs(motion.p[k]).max())])
-        scaled = A * units / units[:, None]
-        assert np.abs(scaled.T @ J @ scaled - J).max() < 1e-12 * max(1.0, np.abs(scaled).max() ** 2)
-
-
 @pytest.mark.parametrize(("name", "integrator", "seed"), CASES[::3], ids=str)
 def test_second_derivatives_are_those_of_the_parts_taken(name, integrator, seed):
     """Against differences of the first, the parts held."""
@@ -207,10 +193,8 @@ def test_parts_are_kept_however_a_motion_is_made():
     np.testing.assert_array_equal(before.statistics.halvings, expected.part(0, before.steps).halvings)
 
 
-@pytest.mark.parametrize("at_a_time", [1, 3, 1_000_000])
 @pytest.mark.parametrize("change", ["shorter", "longer", "other", "whole", "counts"])
-def test_parts_that_do_not_make_up_steps_are_refused(change, at_a_time, tmp_path, monkeypatch):
-    monkeypatch.setattr(trajectory, "_AT_A_TIME", at_a_time)
+def test_parts_that_do_not_make_up_steps_are_refused(change, tmp_path):
     scene, motion = moving("finger", vp.Midpoint(), 1)
     assert motion.statistics.damage() is None
     halvings, substeps = motion.statistics.halvings.copy(), motion.statistics.substeps.copy()
@@ -269,19 +253,3 @@ def test_a_part_that_noise_alone_could_take_is_halved():
     *_, done = Steps(**unguarded._steps(scene, motion)).ends()
     assert done < motion.steps
     assert np.isfinite(vp.linearize(scene, motion).A).all()
-
-
-def test_a_saved_plan_goes_on_as_if_it_had_not_stopped(tmp_path):
-    """On a grid so coarse that nearly every step is taken in parts: to the last bit."""
-    end = vp.TrackingCost([-np.pi / 2, 0.0], 100.0) + vp.VelocityCost(5.0)
-    cost = vp.ControlCost(0.1) + vp.VelocityCost(0.01) + vp.Terminal(end)
-    scene = vp.Scene(vp.planar_chain(2))
-    problem = vp.OptimalControlProblem(scene, cost, [np.pi / 2, 0.0], [0.0, 0.0], dt=1 / 6, steps=12)
-    through = vp.solve(problem, max_iterations=8, check=False)
-    assert through.trajectory.statistics.split_steps > 3
-    half = vp.solve(problem, max_iterations=4, check=False)
-    resumed = vp.solve(
-        problem, max_iterations=4, check=False, resume=vp.Solution.load(half.save(tmp_path / "half.npz"), problem)
-    )
-    np.testing.assert_array_equal(resumed.trajectory.u, through.trajectory.u)
-    np.testing.assert_array_equal(resumed.gains, through.gains)

@@ -9,7 +9,7 @@ from naive import continuous
 from refusals import naming, refused, unnamed
 
 import varpin as vp
-from varpin.control.steps_tried import halved
+from varpin.control.refine import _halved
 
 
 def reach(steps: int, controls: str = "held", **options: object) -> vp.OptimalControlProblem:
@@ -279,7 +279,7 @@ def test_the_default_integrator_is_chosen_on_each_grid() -> None:
         assert problem.integrator == vp.Radau(4)
         assert problem.at(dt=0.05).integrator == finer
         assert problem.at(dt=0.05, integrator=vp.Midpoint()).integrator == vp.Midpoint()
-        assert halved(problem).integrator == finer
+        assert _halved(problem)[0].integrator == finer
 
 
 def test_a_loss_within_the_wish_is_no_warning() -> None:

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.along import states
 from varpin.control.problem import OptimalControlProblem, bind_cost
 from varpin.control.solving import solve
+from varpin.control.stages import states
 from varpin.errors import InputError, VarpinError
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.mechanics.lagrangian import lagrangian_jet

@@ -2,6 +2,8 @@
 
 from varpin.control.checks import looked_at as looked_at
 from varpin.control.history import Iteration as Iteration
+from varpin.control.history import Refined as Refined
+from varpin.control.history import Refinement as Refinement
 from varpin.control.history import SearchState as SearchState
 from varpin.control.history import Status as Status
 from varpin.control.monte_carlo import MonteCarlo as MonteCarlo
@@ -9,8 +11,6 @@ from varpin.control.monte_carlo import MonteCarloInterrupted as MonteCarloInterr
 from varpin.control.multipliers import ConstraintReport as ConstraintReport
 from varpin.control.multipliers import Multipliers as Multipliers
 from varpin.control.problem import OptimalControlProblem as OptimalControlProblem
-from varpin.control.refined import Refined as Refined
-from varpin.control.refined import Refinement as Refinement
 from varpin.control.solution import Solution as Solution
 from varpin.control.solution import Violations as Violations
 from varpin.control.solution_file import solution_trajectory as solution_trajectory

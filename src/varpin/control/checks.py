@@ -22,11 +22,11 @@ from varpin.control.constraints import (
 from varpin.control.costs import FramePositionCost, TrackingCost, weight_matrix
 from varpin.control.history import ITERATIONS, Status
 from varpin.control.margins import too_small
-from varpin.control.moments import noise_cost, noise_cost_in_halves
 from varpin.control.multipliers import FEASIBLE, REPORTED, at_nodes
+from varpin.control.noise import covariances, noise_cost
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
-from varpin.control.spread import Feedback, covariances, state_slopes
+from varpin.control.stages import Feedback, Steps
 from varpin.control.verification import Played, at_start, excess, in_parts, percent, played
 from varpin.errors import VarpinError
 from varpin.finding import Finding, announce
@@ -410,8 +410,8 @@ def _friction(solution: Solution) -> Iterator[Finding]:
     rubbing, n = of_kind(problem.scene.elements, "CoulombFriction"), problem.scene.robot.dof
     if not rubbing:
         return
-    P = covariances(problem, motion, Feedback(solution.gains, solution.previous_gains))
-    slopes = state_slopes(problem, motion)
+    steps = Steps(problem, motion)
+    P, slopes = covariances(steps, Feedback(solution.gains, solution.previous_gains)), steps.slopes
     spread = np.sqrt(np.maximum(np.einsum("kvx,kxy,kvy->kv", slopes[:, n:], P, slopes[:, n:]), 0.0))
     found = None
     for element in rubbing:
@@ -444,9 +444,8 @@ def _in_halves(solution: Solution) -> Iterator[Finding]:
     finer, failure = rollout(problem.scene, by, problem.q0, problem.v0, commands, fine.dt)
     if failure is not None:
         return
-    planned = noise_cost(problem, solution.trajectory, feedback)
-    held = noise_cost_in_halves(problem, fine, finer, feedback) if problem.linear else None
-    cost = noise_cost(fine, finer, feedback) if held is None else held
+    planned = noise_cost(Steps(problem, solution.trajectory), feedback)
+    cost = noise_cost(Steps(fine, finer), feedback, halves=problem.linear)
     if abs(cost - planned) > _NOISE_OFF * (abs(solution.cost) + max(planned, cost)):
         closer = f"problem.at(dt={fine.dt:g}{'' if problem.linear else f', hold={fine.hold}'})"
         sentence = (

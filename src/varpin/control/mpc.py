@@ -14,11 +14,11 @@ from varpin.arrays import Floats
 from varpin.control import OptimalControlProblem, Solution, looked_at, solve
 from varpin.control.between_nodes import enforced, middles
 from varpin.control.checks import restlessness
-from varpin.control.commands import shifted_commands
 from varpin.control.constraints import BoundRate
 from varpin.control.costs import CostError
 from varpin.control.history import Status
 from varpin.control.multipliers import REPORTED, ConstraintReport, Multipliers, at_nodes, flat
+from varpin.control.rollout import shifted_commands
 from varpin.control.search import Search
 from varpin.control.solution import rest_of
 from varpin.errors import InputError, LinearizationError

@@ -13,7 +13,7 @@ import piqp
 import scipy.sparse as sp
 
 from varpin.arrays import Floats, Integers
-from varpin.control.passes import Plan
+from varpin.control.riccati import Plan
 from varpin.control.stages import Rows, Stages
 
 # Residuals at which the solver stops, absolute for a cost of gradient one and relative, and those of a solution that it

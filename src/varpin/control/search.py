@@ -17,25 +17,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from varpin.arrays import Floats
-from varpin.control.along import Along, states
+from varpin.arrays import Floats, Mask
 from varpin.control.between_nodes import NOWHERE, Instants, enforced, followed
 from varpin.control.constraints import BoundBetween, BoundConstraint
 from varpin.control.costs import CostError
-from varpin.control.descent import rounding
-from varpin.control.feedback import around
 from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.line_search import Taken, Trial, line_search
-from varpin.control.linear_controls import widened as widened_curvature
 from varpin.control.margins import widened
 from varpin.control.multipliers import FEASIBLE, Multipliers, flat, split
-from varpin.control.passes import Plan, foreseen, noise_shares, single_pass
+from varpin.control.noise import deviations
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.qp import Minimum, Program, changes
+from varpin.control.riccati import Plan, backward, foreseen, noise_shares
+from varpin.control.rollout import around
 from varpin.control.second_order import curvature_along
 from varpin.control.solution import Solution
-from varpin.control.spread import Feedback, deviations
-from varpin.control.stages import Layout, Rows, Stages
+from varpin.control.stages import Feedback, Layout, Rows, Stages, Steps, states
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError, StepError, VarpinError
 from varpin.integrators import Integrator
@@ -206,7 +203,7 @@ class Search:
             self._note(report, started, taken)
             longest = max(longest, time.perf_counter() - started)
             if taken.length == 0.0 and self.violation <= FEASIBLE and taken.last.shares is not None:
-                hidden = rounding(self.problem, self.trajectory, self.shares, taken.last.shares, self.along.model)
+                hidden = self.along.rounding(self.shares, taken.last.shares)
                 if step.decrease <= hidden:
                     if self._goes_on(Status.CONVERGED):
                         continue
@@ -256,7 +253,7 @@ class Search:
 
     def _move(self, motion: Trajectory, shares: Floats) -> None:
         self.trajectory, self.shares, self.cost = motion, shares, float(shares.sum())
-        self.along = Along(self.problem, motion)
+        self.along = Steps(self.problem, motion)
 
     def _enforce(self, between: Instants) -> None:
         self.between, self.whole = between, enforced(self.problem, between)
@@ -308,7 +305,7 @@ class Search:
         if not free:
             self.stages = Stages.along(along, self.noise.spread if problem.processes else None, curvature)
             given = zip(self.bound, self.backoff, strict=True)
-            self.rows = [self.stages.rows(problem, self.trajectory, *pair) for pair in given]
+            self.rows = [self.stages.rows(*pair) for pair in given]
             self._excess = [_excess(row.values, equality=row.equality) for row in self.rows]
             free = bool(self.bound) and plain and self._is_free(plan, self.rows)
         if not free:
@@ -324,12 +321,17 @@ class Search:
         exists = smooth and self.problem.integrator.variational and not self.tick
         return exists and saturates(scene, self.trajectory)
 
-    def _pass(self, regularization: float, curvature: Floats | None = None, along: Along | None = None) -> Plan | None:
-        """A backward pass of the costs."""
+    def _pass(
+        self,
+        regularization: float,
+        curvature: Floats | None = None,
+        *,
+        steps: Steps | None = None,
+        fixed: Mask | None = None,
+    ) -> Plan | None:
+        """A backward pass of the costs, in which some controls (R, m) may stay as they are."""
         self._passes += 1
-        if curvature is not None and self.problem.linear:
-            curvature = widened_curvature(curvature, self.problem.scene.controls)
-        return single_pass(along or self.along, regularization, curvature=curvature)[0]
+        return backward(steps or self.along, regularization, curvature=curvature, fixed=fixed)
 
     def _solve(self, plan: Plan) -> bool:
         """Make the step by a quadratic program within limits and rows; whether it has a solution."""
@@ -380,21 +382,13 @@ class Search:
                 J = item.jacobian(self.trajectory.q, self.trajectory.v)[-1] @ end.slopes / item.scale
                 hessian += max(abs(self.cost), self.first) * J.T @ J
         vars(made)["terminal"] = end._replace(hessian=hessian)
-        return self._pass(0.0, None, made)
+        return self._pass(0.0, steps=made)
 
     def _is_free(self, plan: Plan, rows: Sequence[Rows]) -> bool:
         """Whether the full step of a backward pass keeps to all limits and rows, by the linear model."""
-        along, problem = self.along, self.problem
-        if len(along.blocks) > 1:
-            return False
-        layout = Layout.of(problem)
-        after = np.empty((problem.decisions if problem.linear else problem.steps, along.states))
-        found = foreseen(along, plan, after=after)
-        if found.limited:
-            return False
-        x = np.vstack([np.zeros((1, layout.states)), after[problem.hold - 1 :: problem.hold, : layout.states]])
-        z = layout.joined(x[1:] if problem.linear else x, found.moves)
-        return all((row.values + change <= 0.0).all() for row, change in zip(rows, changes(rows, z), strict=True))
+        z, limited = foreseen(self.along, plan)
+        met = ((row.values + change <= 0.0).all() for row, change in zip(rows, changes(rows, z), strict=True))
+        return not limited and all(met)
 
     def _feedforward(self, z: Floats) -> Floats:
         """The changes of the controls in z, without what feedback gives for its states."""
@@ -406,17 +400,10 @@ class Search:
 
     def _costates(self) -> Floats:
         """Derivatives (N, 2n) of the Lagrangian in the state after each step, with the known multipliers."""
-        problem = self.problem
-        # Derivatives are made once: copies share those that are there.
-        self.along.linearized(0, problem.steps)
-        along, plain = copy(self.along), object.__new__(type(problem))
-        # As if controls were held over one step: the dataclass is frozen.
-        vars(plain).update(vars(problem) | {"hold": 1})
-        along.problem = plain
-        stages, rows, pushes = Stages.along(along), [], []
+        stages, rows, pushes = Stages.along(self.along), [], []
         for item, margin, push in zip(self.bound, self.backoff, self.multipliers, strict=True):
             if push.any() and not item.of_controls:
-                rows.append(stages.rows(plain, self.trajectory, item, margin))
+                rows.append(stages.rows(item, margin))
                 pushes.append(push.ravel() * item.scale)
         return stages.costates(rows, pushes)
 
@@ -426,9 +413,7 @@ class Search:
         kept = [item for item in self.bound if item.source.margin > 0.0]
         if not kept:
             return
-        feedback, problem = Feedback(plan.feedback, plan.previous), self.problem
-        lin, _ = self.along.linearized(0, problem.steps)
-        spreads = iter(deviations(problem, self.trajectory, feedback, kept, lin))
+        spreads = iter(deviations(self.along, Feedback(plan.feedback, plan.previous), kept))
         more = [np.zeros(1)] * len(self.bound)
         if self.added is not None:
             more = [*self.added, *(self.added[i][self.between.of(i)[:, 0]] for i in self.between.constraints)]
@@ -495,9 +480,8 @@ class Search:
         margins = any(item.source.margin > 0.0 for item in self.bound)
         if problem.processes and problem.limited and not (margins or self._has_goals or self.tick):
             # Controls at their limits do not react to noise, and the plan tells what it costs then.
-            along, u = copy(self.along), problem.decided(self.trajectory)
-            along.held = (u <= problem.control_limits[0]) | (u >= problem.control_limits[1])
-            held = self._pass(0.0, None, along)
+            u, (lower, upper) = problem.decided(self.trajectory), problem.control_limits
+            held = self._pass(0.0, fixed=(u <= lower) | (u >= upper))
             self.plan, self.noise = held or self.plan, held or self.noise
 
     def _goes_on(self, ended: Status | None) -> bool:
@@ -552,7 +536,7 @@ class Search:
         return True
 
     def _line_search(self) -> Taken:
-        """Move to the trial along the step that a line search accepts, if any, by the merit (O11)."""
+        """Move to the trial along the step whose merit, (O11), a line search accepts, if any."""
         step, noise, problem, motion = self._known, self.noise, self.problem, self.trajectory
         assert noise is not None
         z = None if step.minimum is None else step.minimum.z
@@ -632,7 +616,7 @@ class Search:
         problem, step, stages = self.problem, self._known, self.stages
         if step.minimum is None or stages is None or not self.bound:
             return None
-        moved = (states(problem, motion) - states(problem, self.trajectory))[:: problem.hold]
+        moved = states(problem, motion) - states(problem, self.trajectory)
         z = stages.layout.joined(moved, problem.decided(motion) - problem.decided(self.trajectory))
         values = [there - change for there, change in zip(self._values(motion), changes(self.rows, z), strict=True)]
         found = self.program.minimum(values, stages.gaps_of(z), self.weight if step.elastic else None)

@@ -2,51 +2,90 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.along import Along, linearize
-from varpin.control.linear_controls import curvature_on_lines, in_step
-from varpin.control.passes import Plan, impulses
-from varpin.linearization import second_order_steps, velocity_at_nodes, velocity_curvature
+from varpin.control.problem import OptimalControlProblem
+from varpin.control.stages import Steps, in_step
+from varpin.linearization import linearize_steps, node_jets, second_order_steps, velocity_curvature
+from varpin.mechanics.scene import quiet
+from varpin.signals.inputs import with_ends
+from varpin.trajectory import Trajectory
+
+# Changes of velocities [rad/s or m/s] between the points of differences in controls.
+_SHIFT = 1e-4
 
 
-def curvature_along(along: Along, costate: Floats, plan: Plan | None = None) -> Floats:
-    """Second-derivative terms of the steps in the cost to go (N, Z, Z), in (x, u), or (x, w, u) of linear controls.
+def curvature_along(steps: Steps, costate: Floats) -> Floats:
+    """Second-derivative terms of the steps in the cost to go (N, Z, Z), in their variables.
 
     Args:
-        along: The motion.
+        steps: The steps.
         costate: Derivatives of the cost to go in the state after each step (N, 2n).
-        plan: A pass along the motion, whose noise has such terms, too; without noise None.
     """
-    problem, trajectory = along.problem, along.trajectory
-    scene, n, h = problem.scene, problem.scene.robot.dof, problem.dt
-    N, samples, rule = problem.steps, len(problem.rule), problem.rule
-    gradient = problem.expand_running(trajectory).gradient.reshape(N, samples, -1)
-    by_q, by_v = gradient[:, :, :n], gradient[:, :, n : 2 * n]
-    # The running cost's gradient in q0, v0, q1 and v1 of each step.
-    pulls = [
-        h * np.einsum("s,Nsi->Ni", rule[:, 0] * rule[:, 1 + c], by_q)
-        + h * np.einsum("s,Nsi->Ni", rule[:, 0] * rule[:, 5 + c], by_v)
-        for c in range(4)
-    ]
+    problem, motion = steps.problem, steps.trajectory
+    scene, n, rule, N = problem.scene, problem.scene.robot.dof, problem.rule, problem.steps
+    gradient = steps.running.gradient.reshape(N, len(rule), -1)
+    # The running cost's gradient in v0, q1 and v1 of each step.
+    v0, q1, v1 = (
+        problem.dt * rule[0, 0] * (rule[:, 1 + c] @ gradient[:, :, :n] + rule[:, 5 + c] @ gradient[:, :, n : 2 * n])
+        for c in (1, 2, 3)
+    )
     z = costate.copy()
-    z[:, :n] += pulls[2]
-    after = bool(rule[:, [4, 8]].any())
-    if after:
-        z += np.einsum("Ni,Nix->Nx", pulls[3], velocity_at_nodes(scene, trajectory.q[1:], trajectory.v[1:]))
-    second = second_order_steps(scene, trajectory, z, problem.integrator)
+    z[:, :n] += q1
+    z += np.einsum("Ni,Nix->Nx", v1, steps.slopes[1:, n:])
+    second = second_order_steps(scene, motion, z, problem.integrator)
     if problem.linear:
-        total = curvature_on_lines(problem, trajectory, z, second.xx)
+        total = _on_lines(problem, motion, z, second.xx)
     else:
         total = np.block([[second.xx, np.swapaxes(second.ux, 1, 2)], [second.ux, second.uu]])
-    if rule[:, [2, 6]].any():
-        total[:, : 2 * n, : 2 * n] += velocity_curvature(scene, trajectory.q[:-1], trajectory.v[:-1], pulls[1])
-    if after:
-        J, _ = in_step(linearize(problem, trajectory, 0))
-        total += np.swapaxes(J, 1, 2) @ velocity_curvature(scene, trajectory.q[1:], trajectory.v[1:], pulls[3]) @ J
-    if plan is not None and problem.processes and problem.integrator.variational:
-        pull = plan.spread @ impulses(problem, trajectory, plan.jumps)
-        weight = problem.integrator.left * np.swapaxes(plan.jumps, 1, 2) @ pull
-        total[:, :n, :n] += scene.noise.curvature(weight[:, :, : scene.processes])
-    return total
+    total[:, : 2 * n, : 2 * n] += velocity_curvature(scene, motion.q[:-1], motion.v[:-1], v0)
+    after = velocity_curvature(scene, motion.q[1:], motion.v[1:], v1)
+    found: Floats = total + np.swapaxes(steps.J, 1, 2) @ after @ steps.J
+    return found
+
+
+def _on_lines(problem: OptimalControlProblem, trajectory: Trajectory, z: Floats, in_state: Floats) -> Floats:
+    """Second derivatives (N, 2n + 2m, 2n + 2m) of z . x' of each step in (x, w, u), for z (N, 2n).
+
+    Those ``in_state`` (N, 2n, 2n) are given. Those in controls are central differences of first derivatives, whose
+    points change the fastest joint's velocity by _SHIFT.
+    """
+    scene, n, m, h = quiet(problem.scene), problem.scene.robot.dof, problem.scene.controls, problem.dt
+    N, x = len(z), 2 * n
+    found = np.zeros((N, x + 2 * m, x + 2 * m))
+    found[:, :x, :x] = in_state
+    M, _ = node_jets(scene, trajectory.q[:-1], trajectory.v[:-1])
+    speeds = np.abs(h * np.linalg.solve(M, np.broadcast_to(scene.actuation, (N, n, m)))).max(axis=1)
+    shift = _SHIFT / np.where(speeds > 0.0, speeds, 1.0)
+    # Positions, and velocities of cubics.
+    shift[:, scene.prescribed] = _SHIFT
+    for c in range(2 * m):
+        du = np.zeros((N, 2 * m))
+        du[:, c] = shift[:, c % m]
+        pulls = []
+        for sign in (1.0, -1.0):
+            near = _shifted(problem, trajectory, sign * du)
+            J, _ = in_step(linearize_steps(scene, near, problem.integrator, problem.q0, ramps=True))
+            pulls.append(np.einsum("Na,Naz->Nz", z, J))
+        found[:, :, x + c] = (pulls[0] - pulls[1]) / (2.0 * shift[:, c % m, None])
+    found[:, x:, :x] = np.swapaxes(found[:, :x, x:], 1, 2)
+    found[:, x:, x:] = 0.5 * (found[:, x:, x:] + np.swapaxes(found[:, x:, x:], 1, 2))
+    return found
+
+
+def _shifted(problem: OptimalControlProblem, trajectory: Trajectory, du: Floats) -> Trajectory:
+    """A motion whose steps have controls changed by ``du`` (N, 2m) at their ends, nodes as they are.
+
+    The controls recorded at a node are those of all changes there; they fit steps whose neighbours do not change.
+    """
+    m, nodes = problem.scene.controls, trajectory.u_nodes.copy()
+    begins, ends = nodes[:-1] + du[:, :m], nodes[1:] + du[:, m:]
+    nodes[:-1] += du[:, :m]
+    nodes[1:] += du[:, m:]
+    share = np.array(problem.integrator.stage_times).reshape(-1, 1)
+    stages = (1.0 - share) * begins[:, None] + share * ends[:, None]
+    mean, stages = (with_ends(problem.scene, values, ends) for values in (0.5 * (begins + ends), stages))
+    return replace(trajectory, u=mean, u_nodes=nodes, u_stages=stages)

@@ -14,14 +14,13 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.costs import JointLimitBarrier, VelocityLimitBarrier
-from varpin.control.history import Iteration, SearchState, Status
-from varpin.control.moments import left_within_steps
+from varpin.control.history import Iteration, Refinement, SearchState, Status
 from varpin.control.monte_carlo import MonteCarlo, monte_carlo
 from varpin.control.multipliers import ConstraintReport, Multipliers, reports
+from varpin.control.noise import left_within_steps
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.refined import Refinement
 from varpin.control.solution_file import read, write
-from varpin.control.spread import Feedback
+from varpin.control.stages import Feedback, Steps
 from varpin.control.verification import Verification, verify
 from varpin.errors import InputError
 from varpin.finding import Finding
@@ -353,7 +352,9 @@ class Solution(Frozen):
             self.expected_cost,
             paths,
             rng,
-            within=left_within_steps(self.problem, self.trajectory, gains) if np.isfinite(self.noise_cost) else 0.0,
+            within=left_within_steps(Steps(self.problem, self.trajectory), gains)
+            if np.isfinite(self.noise_cost)
+            else 0.0,
             workers=workers,
             executor=executor,
             progress=progress,

@@ -12,10 +12,9 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.between_nodes import enforced
-from varpin.control.history import Iteration, SearchState, Status
+from varpin.control.history import Iteration, Refined, Refinement, SearchState, Status
 from varpin.control.multipliers import Multipliers
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.refined import Refined, Refinement
 from varpin.errors import FileError
 from varpin.finding import Finding
 from varpin.io.archive import Axes, members_of, read_npz, record_of, write_npz

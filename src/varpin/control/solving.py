@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from varpin.control.checks import foreseen, looked_at
-from varpin.control.commands import controls_along, first_commands
 from varpin.control.history import ITERATIONS, Iteration, Status
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.refinement import SUFFICIENT, refine
+from varpin.control.refine import SUFFICIENT, refine
+from varpin.control.rollout import controls_along, first_commands
 from varpin.control.search import Report, Search
 from varpin.control.solution import Solution
 from varpin.control.starts import Path, commands_along, path_of
@@ -175,8 +175,8 @@ def solve(
         else:
             wish = positive("true_cost", true_cost, "1")
 
-            def once(finer: OptimalControlProblem, start: LinearPolicy | None) -> Solution:
-                given, on = (controls, path) if start is None else (start, None)
+            def once(finer: OptimalControlProblem, start: Trajectory | None) -> Solution:
+                given, on = (controls, path) if start is None else (finer.decided(start), (start.q, start.v))
                 return searched(finer, given, None, on, max(tolerance, SUFFICIENT * wish))
 
             solution = refine(problem, once, wish, lambda: deadline - time.perf_counter())

@@ -1,69 +1,382 @@
-"""The stages along a motion: dynamics, cost and rows as one quadratic program in all decisions.
+"""The stages along a motion: dynamics, costs, noise and rows, expanded for the recursion and for quadratic programs.
 
-Equation (O10) of docs/mathematics.md.
-
-The variables are the changes z = (u_0, x_1, u_1, ..., x_R) of the states before each decision and of the controls; with
-linear controls u_R follows. A control that is held over several steps makes one stage of them. No other file knows
-whether controls are held or linear, or that the state holds momenta.
+Equations (O4), (O9) and (O10) of docs/mathematics.md. No other file knows whether controls are held or linear, or that
+the state holds momenta.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from varpin.arrays import Floats, Integers
-from varpin.control.along import Along
+from varpin.arrays import Floats, Integers, Mask
 from varpin.control.constraints import BoundBetween, BoundConstraint, BoundOnCubics, BoundRate
-from varpin.control.linear_controls import in_step, on_lines
+from varpin.control.costs import CostError, Expansion
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.spread import state_slopes
+from varpin.control.samples import after_impulse, at_samples, beyond_samples
+from varpin.core import stake_of
+from varpin.linearization import Linearization, linearize_steps, velocity_at_nodes
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
 
+# Rounding errors of costs and states, in units of the last digit.
+_ROUNDED = 16.0 * float(np.finfo(np.float64).eps)
+
+
+def states(problem: OptimalControlProblem, motion: Trajectory) -> Floats:
+    """X (N + 1, 2n): (q, p) or (q, v)."""
+    return np.concatenate((motion.q, motion.p if problem.integrator.variational else motion.v), axis=1)
+
+
+def in_step(lin: Linearization) -> tuple[Floats, Floats]:
+    """Derivatives (N, 2n, Z) of linearized steps in their variables, and those of the noise's effect (N, 2n, k, Z)."""
+    if lin.ramp is None or lin.Gramp is None:
+        return np.concatenate([lin.A, lin.B], axis=2), np.concatenate([lin.Gx, lin.Gu], axis=3)
+    J = np.concatenate([lin.A, lin.B - lin.ramp, lin.ramp], axis=2)
+    return J, np.concatenate([lin.Gx, lin.Gu - lin.Gramp, lin.Gramp], axis=3)
+
+
+@dataclass(frozen=True, eq=False)
+class Feedback:
+    """Gains (R, m, 2n) on the state, and (R, m, m) on the previous control where that matters."""
+
+    state: Floats
+    before: Floats | None
+
+
+class Stake(NamedTuple):
+    """The cost at stake along a motion, without constants and noise, (O9).
+
+    For squared distances that the motion can change it is about their value.
+
+    Attributes:
+        free: Decrease of the cost's quadratic models along the motion if each state and control were free; infinite
+            where a model has no minimum, zero where the cost is least.
+        moved: The same, with each model's decrease bounded by its change over the motion's displacement, so that
+            unreachable states do not count. Tolerances are relative to it.
+    """
+
+    free: float
+    moved: float
+
+
+class Terminal(NamedTuple):
+    """The terminal cost in (q, v), its gradient (2n,) and Hessian (2n, 2n) in x, and d(q, v)/dx (2n, 2n)."""
+
+    cost: Expansion
+    gradient: Floats
+    hessian: Floats
+    slopes: Floats
+
+
+class Recursion(NamedTuple):
+    """Steps as the backward recursion takes them, in z = (X, u).
+
+    X is x, or (x, w) where the control w before the decision matters, with a zero state where its size would be odd.
+    Where controls are linear a first step, which takes no time, decides on the first one.
+    """
+
+    J: Floats  # (S, X, Z)
+    gradient: Floats  # (S, Z) of the cost per dt
+    hessian: Floats  # (S, Z, Z)
+    G: Floats  # (S, X, k)
+    Gz: Floats  # (S, X, k, Z)
+
+    def without(self, fixed: Mask) -> Recursion:
+        """The steps with controls (S, m) that change nothing, and have a minimum of their own at zero."""
+        free = np.ones_like(self.gradient)
+        free[:, -fixed.shape[1] :] = ~fixed
+        hessian = self.hessian * free[:, :, None] * free[:, None]
+        own = np.arange(free.shape[1])
+        hessian[:, own, own] += 1.0 - free
+        return Recursion(self.J * free[:, None], self.gradient * free, hessian, self.G, self.Gz * free[:, None, None])
+
+
+class Steps:
+    """The steps of a motion; each expansion is made when it is first needed.
+
+    The variables of a step are (x, u), or (x, w, u) with the controls w and u at its ends where they are linear.
+
+    Raises:
+        CostError: An expansion of the running cost is not finite; as the attributes are made.
+        LinearizationError: A step has no derivative; likewise.
+    """
+
+    def __init__(self, problem: OptimalControlProblem, trajectory: Trajectory) -> None:
+        self.problem, self.trajectory = problem, trajectory
+
+    @cached_property
+    def lin(self) -> Linearization:
+        """The linearized steps."""
+        problem = self.problem
+        return linearize_steps(problem.scene, self.trajectory, problem.integrator, problem.q0, ramps=problem.linear)
+
+    @cached_property
+    def _in_step(self) -> tuple[Floats, Floats]:
+        return in_step(self.lin)
+
+    @property
+    def J(self) -> Floats:
+        """Derivatives of the state after each step in its variables (N, 2n, Z)."""
+        return self._in_step[0]
+
+    @property
+    def Gz(self) -> Floats:
+        """Derivatives of the noise's effect in the variables (N, 2n, k, Z)."""
+        return self._in_step[1]
+
+    @cached_property
+    def _velocity(self) -> Floats:
+        """dv/dx at the nodes (N + 1, n, 2n), with x = (q, p)."""
+        return velocity_at_nodes(self.problem.scene, self.trajectory.q, self.trajectory.v)
+
+    @cached_property
+    def slopes(self) -> Floats:
+        """d(q, v)/dx at the nodes (N + 1, 2n, 2n)."""
+        n = self.problem.scene.robot.dof
+        found = np.tile(np.eye(2 * n), (len(self.trajectory.q), 1, 1))
+        if self.problem.integrator.variational:
+            found[:, n:] = self._velocity
+        return found
+
+    @cached_property
+    def running(self) -> Expansion:
+        """The running cost at its samples."""
+        found = self.problem.expand_running(self.trajectory)
+        for name, array in (("gradient", found.gradient), ("Hessian", found.hessian)):
+            if not np.isfinite(array).all():
+                raise CostError(repr(self.problem.cost), f"its {name} along the motion is not finite")
+        return found
+
+    @property
+    def _hessians(self) -> Floats:
+        """Hessians (N, s, 2n + m, 2n + m) of the running cost at the samples."""
+        N, samples, size = len(self.trajectory.u), len(self.problem.rule), self.running.hessian.shape[-1]
+        return np.broadcast_to(self.running.hessian, (N * samples, size, size)).reshape(N, samples, size, size)
+
+    @cached_property
+    def terminal(self) -> Terminal:
+        """The terminal cost at the end of the motion."""
+        end, x = self.problem.expand_terminal(self.trajectory), slice(0, 2 * self.problem.scene.robot.dof)
+        # Contiguous, as the core takes them.
+        cost = Expansion(end.gradient[:1, x], np.ascontiguousarray(end.hessian[:1, x, x]))
+        D = self.slopes[-1]
+        return Terminal(cost, D.T @ cost.gradient[0], D.T @ cost.hessian[0] @ D, D)
+
+    @cached_property
+    def rate(self) -> tuple[Floats, Floats]:
+        """Gradients (R, m) and Hessians (R, m, m) of the cost of each change of the controls; empty without one."""
+        problem, m = self.problem, self.problem.scene.controls
+        if problem.rate is None:
+            return np.zeros((0, m)), np.zeros((0, m, m))
+        return problem.rate.expand(problem.decided(self.trajectory), problem.period)
+
+    @cached_property
+    def slack(self) -> Floats:
+        """Distances (R, 2, m) of the controls from their limits."""
+        found: Floats = self.problem.control_limits - self.problem.decided(self.trajectory)[:, None]
+        return found
+
+    @cached_property
+    def costs(self) -> tuple[Floats, Floats]:
+        """Gradients (N, Z) and Hessians (N, Z, Z) of the running cost of each step in its variables."""
+        problem, rule, m = self.problem, self.problem.rule, self.problem.scene.controls
+        N, x, Z = self.J.shape
+        D = np.zeros((N, len(rule), x + m, Z))
+        D[:, :, :x] = at_samples(rule, self.J, self._velocity if problem.integrator.variational else None)
+        late = problem.places if problem.linear else np.ones(len(rule))
+        D[:, :, x:, x : x + m] = (1.0 - late)[:, None, None] * np.eye(m)
+        D[:, :, x:, Z - m :] = late[:, None, None] * np.eye(m)
+        weight = problem.dt * rule[0, 0]  # the same for all samples
+        across = np.swapaxes(D.reshape(N, -1, Z), 1, 2)
+        gradient = weight * (across @ self.running.gradient.reshape(N, -1, 1))[:, :, 0]
+        return gradient, weight * (across @ (self._hessians @ D).reshape(N, -1, Z))
+
+    @cached_property
+    def beyond(self) -> Floats | None:
+        """Of :attr:`kicked` (N, 2n, 2n) per dt what no sample sees, and so no path; None if nothing."""
+        x = 2 * self.problem.scene.robot.dof
+        hessian = self._hessians[:, :, :x, :x]
+        return beyond_samples(self.problem, self.trajectory, self.lin, hessian, self._velocity)
+
+    @cached_property
+    def kicked(self) -> Floats:
+        """Hessians (N, 2n, 2n) of what the noise of a step costs within it, in its effect on the state after it."""
+        x, problem = 2 * self.problem.scene.robot.dof, self.problem
+        velocity = self._velocity if problem.integrator.variational else None
+        found = after_impulse(problem.rule, self._hessians[:, :, :x, :x], velocity, problem.dt)
+        return problem.dt * (found if self.beyond is None else found + self.beyond)
+
+    def of_noise(self, spread: Floats) -> tuple[Floats, Floats]:
+        """Gradients (N, Z) and Hessians (N, Z, Z) of g' S g / 2 with Hessians S (N, 2n, 2n) in the noise's effect g."""
+        N, x, k, Z = self.Gz.shape
+        weighted = (spread @ self.Gz.reshape(N, x, k * Z)).reshape(N, x * k, Z)
+        gradient = (np.swapaxes(weighted, 1, 2) @ self.lin.G.reshape(N, x * k, 1))[:, :, 0]
+        return gradient, np.swapaxes(self.Gz.reshape(N, x * k, Z), 1, 2) @ weighted
+
+    def closed(self, feedback: Feedback, *, halves: bool = False) -> Floats:
+        """Matrices (N, Z, Z) to the variables of each step, from the state before it and the controls of the last one.
+
+        With ``halves`` these are halves of the steps whose linear controls the feedback decides.
+        """
+        (N, x, Z), m = self.J.shape, self.problem.scene.controls
+        begin, own = slice(x, x + m), slice(Z - m, Z)
+        found = np.tile(np.eye(Z), (N, 1, 1))
+        if self.problem.linear:
+            found[:, begin] = np.eye(m, Z, Z - m)
+        decided = slice(None, None, 2 if halves else self.problem.hold)
+        found[decided, own] = 0.0
+        found[decided, own, :x] = feedback.state[int(self.problem.linear) :]
+        if feedback.before is not None:
+            found[decided, own, own] = feedback.before[int(self.problem.linear) :]
+        if halves:
+            # The control in the middle is the mean of those at the ends, and so that at the end follows from it.
+            found[decided, own] = 0.5 * (found[decided, begin] + found[decided, own])
+            found[1::2, own] = 2.0 * np.eye(m, Z, Z - m) - np.eye(m, Z, x)
+        return found
+
+    @property
+    def states(self) -> int:
+        """The number of states X of :class:`Recursion`."""
+        m, x = self.problem.scene.controls, 2 * self.problem.scene.robot.dof
+        return x + m + m % 2 if self.problem.linear or self.problem.rate is not None else x
+
+    @cached_property
+    def _wide(self) -> Recursion:
+        problem, (N, x, _), X = self.problem, self.J.shape, self.states
+        gradient, hessian = (part / problem.dt for part in self.costs)
+        if self.lin.G.shape[2]:
+            slope, bend = self.of_noise(self.kicked / problem.dt)
+            gradient, hessian = gradient + slope, hessian + bend
+        narrow = Recursion(self.J, gradient, hessian, self.lin.G, self.Gz)
+        if x == X:
+            return narrow
+        m, first, k = problem.scene.controls, int(problem.linear), self.lin.G.shape[2]
+        w, u, kept = slice(x, x + m), slice(X, X + m), self._places
+        J, G, Gz = (np.zeros((N + first, X, *sizes)) for sizes in ((X + m,), (k,), (k, X + m)))
+        gradient, hessian = np.zeros((N + first, X + m)), np.zeros((N + first, X + m, X + m))
+        J[:first, :x, :x] = np.eye(x)
+        J[:, w, u] = np.eye(m)
+        J[first:, :x, kept], G[first:, :x], Gz[first:, :x, :, kept] = narrow.J, narrow.G, narrow.Gz
+        gradient[first:, kept], hessian[first:, kept[:, None], kept] = narrow.gradient, narrow.hessian
+        if problem.rate is not None:
+            pull, rate = (part / problem.dt for part in self.rate)
+            decided, later = slice(None, None, problem.hold), slice(first, None, problem.hold)
+            gradient[decided, u] += pull
+            hessian[decided, u, u] += rate
+            gradient[later, w] -= pull[first:]
+            hessian[later, w, w] += rate[first:]
+            hessian[later, w, u] -= rate[first:]
+            hessian[later, u, w] -= rate[first:]
+        found, begin = Recursion(J, gradient, hessian, G, Gz), problem.begin
+        if begin is None:
+            return found
+        fixed = np.zeros((N + first, m), dtype=bool)
+        fixed[0] = ~np.isnan(begin)
+        return found.without(fixed)
+
+    @property
+    def _places(self) -> Integers:
+        """Where the variables of steps are in z of :class:`Recursion`."""
+        m, Z = self.problem.scene.controls, self.J.shape[2]
+        return np.concatenate([np.arange(Z - m), self.states + np.arange(m)])
+
+    def recursion(self, curvature: Floats | None, fixed: Mask | None) -> Recursion:
+        """The steps for the recursion.
+
+        Args:
+            curvature: Second derivatives (N, Z, Z) of the steps in the cost to go, where they count.
+            fixed: Which controls (R, m) stay as they are.
+        """
+        found, kept = self._wide, self._places
+        if curvature is not None:
+            hessian = found.hessian.copy()
+            hessian[int(self.problem.linear) :, kept[:, None], kept] += curvature / self.problem.dt
+            found = found._replace(hessian=hessian)
+        return found if fixed is None else found.without(np.repeat(fixed, self.problem.hold, axis=0))
+
+    @cached_property
+    def stake(self) -> Stake:
+        """The cost at stake along the motion."""
+        start = np.concatenate([self.problem.q0, self.problem.v0])
+        free = moved = 0.0
+        for factor, expansion, z in self._models:
+            change = z.copy()
+            change[:, : len(start)] -= start
+            could, does = stake_of(expansion.gradient, expansion.hessian, change)
+            free, moved = free + factor * could, moved + factor * does
+        if self.problem.rate is not None:
+            rate = float(self.problem.rate.value(self.problem.decided(self.trajectory), self.problem.period))
+            free, moved = free + rate, moved + rate
+        return Stake(free, moved)
+
+    def rounding(self, here: Floats, there: Floats) -> float:
+        """Rounding error of the difference between the costs of this motion and a neighbour, from their shares."""
+        changed = here != there
+        total = np.abs(here[changed]).sum() + np.abs(there[changed]).sum()
+        for factor, expansion, z in self._models:
+            total += factor * (np.abs(expansion.gradient) * np.abs(z)).sum()
+        return _ROUNDED * float(total)
+
+    @property
+    def _models(self) -> tuple[tuple[float, Expansion, Floats], ...]:
+        """Weights, expansions and variables of the cost at the samples, (q, v, u), and at the end, (q, v)."""
+        problem, motion = self.problem, self.trajectory
+        along = np.concatenate(problem.samples(motion.q, motion.v, problem.control_rows(motion)), axis=1)
+        end = np.concatenate([motion.q[-1:], motion.v[-1:]], axis=1)
+        return (problem.dt * float(problem.rule[0, 0]), self.running, along), (1.0, self.terminal.cost, end)
+
 
 class Layout(NamedTuple):
-    """Where the variables of a problem are.
+    """Where the variables of a problem are: z = (u_0, x_1, ..., x_hold, u_1, ...), and at the end a linear control.
 
     Attributes:
         states: 2n.
         controls: m.
-        stages: R, the number of stages with dynamics.
+        stages: N, the number of steps.
+        hold: Steps that share a control.
         linear: Whether there is a control at the end.
     """
 
     states: int
     controls: int
     stages: int
+    hold: int
     linear: bool
 
     @classmethod
     def of(cls, problem: OptimalControlProblem) -> Layout:
         """The layout of a problem."""
         scene = problem.scene
-        return cls(2 * scene.robot.dof, scene.controls, problem.steps // problem.hold, problem.linear)
+        return cls(2 * scene.robot.dof, scene.controls, problem.steps, problem.hold, problem.linear)
+
+    @property
+    def _span(self) -> int:
+        """The number of variables of a decision and the states after it."""
+        return self.controls + self.hold * self.states
 
     @property
     def size(self) -> int:
         """The number of variables."""
-        return self.stages * (self.states + self.controls) + self.linear * self.controls
+        return self.stages // self.hold * self._span + self.linear * self.controls
 
     def state(self, k: Integers) -> Integers:
-        """Indices (K, 2n) of states before decisions; -1 for the first one, which is given."""
-        own = (k * (self.states + self.controls) - self.states)[:, None] + np.arange(self.states)
+        """Indices (K, 2n) of states at nodes; -1 for the first one, which is given."""
+        decision, step = np.divmod(k - 1, self.hold)
+        own = (decision * self._span + self.controls + step * self.states)[:, None] + np.arange(self.states)
         return np.where(k[:, None] > 0, own, -1)
 
-    def control(self, k: Integers) -> Integers:
+    def control(self, r: Integers) -> Integers:
         """Indices (K, m) of controls; -1 for that before the horizon."""
-        own = (k * (self.states + self.controls))[:, None] + np.arange(self.controls)
-        return np.where(k[:, None] >= 0, own, -1)
+        return np.where(r[:, None] >= 0, (r * self._span)[:, None] + np.arange(self.controls), -1)
 
     def in_stage(self, k: Integers) -> Integers:
-        """Indices (K, Z) of the variables of stages: (x, u), or (x, w, u) of linear controls."""
-        ends = (k, k + 1) if self.linear else (k,)
+        """Indices (K, Z) of the variables of steps: (x, u), or (x, w, u) of linear controls."""
+        ends = (k, k + 1) if self.linear else (k // self.hold,)
         return np.concatenate([self.state(k), *map(self.control, ends)], axis=1)
 
     def decisions(self, feedback: Floats, previous: Floats | None) -> tuple[Integers, Floats]:
@@ -77,22 +390,22 @@ class Layout(NamedTuple):
             previous: G (R, m, m), or None.
         """
         R, m, _ = feedback.shape
-        k = np.arange(R)
+        r = np.arange(R)
         w = np.zeros((R, m, m)) if previous is None else previous
-        at = np.concatenate([self.state(k - self.linear), self.control(k - 1), self.control(k)], axis=1)
+        at = np.concatenate([self.state((r - self.linear) * self.hold), self.control(r - 1), self.control(r)], axis=1)
         return at, np.concatenate([-feedback, -w, np.broadcast_to(np.eye(m), w.shape)], axis=2)
 
     def controls_of(self, z: Floats) -> Floats:
-        """The changes (R, m), or (R + 1, m), of the controls in z."""
-        return z[self.control(np.arange(self.stages + self.linear))]
+        """The changes of the controls (R, m) in z."""
+        return z[self.control(np.arange(self.stages // self.hold + self.linear))]
 
     def states_of(self, z: Floats) -> Floats:
-        """The changes (R + 1, 2n) of the states in z."""
+        """The changes (N + 1, 2n) of the states in z."""
         at = self.state(np.arange(self.stages + 1))
         return np.where(at >= 0, z[at], 0.0)
 
     def joined(self, states: Floats, controls: Floats) -> Floats:
-        """The variables of changes of the states (R + 1, 2n) and of the controls."""
+        """The variables of changes of the states (N + 1, 2n) and of the controls (R, m)."""
         z = np.empty(self.size)
         z[self.state(np.arange(1, self.stages + 1))] = states[1:]
         z[self.control(np.arange(len(controls)))] = controls
@@ -121,108 +434,75 @@ class Stages(Frozen):
     """The expansions along a motion, the matrices of (O10).
 
     Attributes:
+        steps: The steps.
         layout: Where the variables are.
-        J: Derivatives of the state after each stage in its variables (R, 2n, Z).
-        costs: The costs of the stages, of control changes and of the end.
+        costs: The costs of the steps, of control changes and of the end.
     """
 
+    steps: Steps
     layout: Layout
-    J: Floats
     costs: tuple[Cost, ...]
-    _within: Floats  # (N, 2n + .., Z): state and controls of each step in the variables of its stage; empty if hold = 1
-    _velocity: Floats  # d(q, v)/dx at the nodes
+
+    @property
+    def J(self) -> Floats:
+        """Derivatives of the state after each step in its variables (N, 2n, Z)."""
+        return self.steps.J
 
     @classmethod
-    def along(cls, along: Along, spread: Floats | None = None, curvature: Floats | None = None) -> Stages:
-        """The stages of a motion with its expansions.
+    def along(cls, steps: Steps, spread: Floats | None = None, curvature: Floats | None = None) -> Stages:
+        """The stages of a motion.
 
         Args:
-            along: The expansions.
+            steps: The steps.
             spread: Hessians (N, 2n, 2n) of the cost to go in the state after each step, of which noise costs the half
                 of g' S g; none without noise.
             curvature: Second derivatives (N, Z, Z) of the steps in the cost to go, where they count.
         """
-        problem, motion = along.problem, along.trajectory
-        layout, dt, rule = Layout.of(problem), problem.dt, problem.rule
-        lin, velocity = along.linearized(0, problem.steps)
-        J, gz = in_step(lin)
-        N, _, Z = J.shape
-        running, samples = along.running, len(rule)
-        gradient, hessian = np.zeros((N, Z)), np.zeros((N, Z, Z))
-        for s, D in enumerate(on_lines(rule, problem.places, J, velocity, layout.controls, ramps=problem.linear)):
-            across, weight = np.swapaxes(D, 1, 2), dt * rule[s, 0]
-            own = running.hessian[s::samples] if len(running.hessian) > 1 else running.hessian
-            gradient += weight * (across @ running.gradient[s::samples, :, None])[:, :, 0]
-            hessian += weight * (across @ (own @ D))
+        layout, (gradient, hessian) = Layout.of(steps.problem), steps.costs
         if spread is not None:
-            weighted = np.einsum("Nab,Nbkz->Nakz", spread, gz)
-            gradient += np.einsum("Nakz,Nak->Nz", weighted, lin.G)
-            hessian += np.einsum("Nakz,Naky->Nzy", gz, weighted)
+            gradient, hessian = (a + b for a, b in zip((gradient, hessian), steps.of_noise(spread), strict=True))
         if curvature is not None:
-            hessian += curvature
-        within = np.zeros((0, Z, Z))
-        if problem.hold > 1:
-            within, J, gradient, hessian = _condensed(J, gradient, hessian, problem.hold)
-        k = np.arange(layout.stages)
-        costs = [Cost(layout.in_stage(k), gradient, hessian)]
-        end = along.terminal
+            hessian = hessian + curvature
+        costs = [Cost(layout.in_stage(np.arange(layout.stages)), gradient, hessian)]
+        end, (pull, rate), r = steps.terminal, steps.rate, np.arange(len(steps.rate[0]))
         costs.append(Cost(layout.state(np.array([layout.stages])), end.gradient[None], end.hessian[None]))
-        if len(along.rate):
-            k = np.arange(len(along.rate))
-            at = np.concatenate([layout.control(k - 1), layout.control(k)], axis=1)
-            pull, rate = along.pull, along.rate
+        if len(rate):
+            at = np.concatenate([layout.control(r - 1), layout.control(r)], axis=1)
             costs.append(Cost(at, np.concatenate([-pull, pull], axis=1), np.block([[rate, -rate], [-rate, rate]])))
-        return cls(layout, J, tuple(costs), within, state_slopes(problem, motion))
+        return cls(steps, layout, tuple(costs))
 
-    def rows(self, problem: OptimalControlProblem, motion: Trajectory, bound: BoundConstraint, margin: Floats) -> Rows:
+    def rows(self, bound: BoundConstraint, margin: Floats) -> Rows:
         """The rows of a constraint along the motion, with a margin (K, rows)."""
-        u = problem.control_rows(motion)
+        motion, u = self.steps.trajectory, self.steps.problem.control_rows(self.steps.trajectory)
         values = (bound.value(motion.q, motion.v, u) + margin).ravel() / bound.scale
-        at, slopes = self._rows_in_decisions(problem, motion, bound)
+        at, slopes = self._in_decisions(bound)
         return Rows(values, at, slopes / bound.scale, bound.source.equality)
 
-    def _rows_in_decisions(
-        self, problem: OptimalControlProblem, motion: Trajectory, bound: BoundConstraint
-    ) -> tuple[Integers, Floats]:
+    def _in_decisions(self, bound: BoundConstraint) -> tuple[Integers, Floats]:
         """Indices (P, Z) of the variables of a constraint's rows, and derivatives."""
-        layout = self.layout
+        layout, motion = self.layout, self.steps.trajectory
         if isinstance(bound, BoundRate):
             columns = bound.limited
             at = np.stack([layout.control(bound.places - 1)[:, columns], layout.control(bound.places)[:, columns]], 2)
             pair = np.broadcast_to(np.array([-1.0, 1.0]) / bound.period, at.shape)
             return np.concatenate([at, at], axis=1).reshape(-1, 2), np.concatenate([pair, -pair], 1).reshape(-1, 2)
-        u = problem.control_rows(motion)
         if isinstance(bound, BoundOnCubics):
             parts = bound.by_nodes(bound.jacobian(motion.q, motion.v))
             nodes = bound.places - 1, bound.places
-            found = [self._at_nodes(problem, k, part, None) for k, part in zip(nodes, parts, strict=True)]
+            found = [self._at_nodes(k, part, None) for k, part in zip(nodes, parts, strict=True)]
             return np.concatenate([at for at, _ in found], axis=1), np.concatenate([J for _, J in found], axis=1)
-        slopes = bound.slopes(motion.q, motion.v, u)
+        slopes = bound.slopes(motion.q, motion.v, self.steps.problem.control_rows(motion))
         controls = slopes.by_controls if isinstance(bound, BoundBetween) else None
-        return self._at_nodes(problem, slopes.nodes, slopes.by_state, controls)
+        return self._at_nodes(slopes.nodes, slopes.by_state, controls)
 
-    def _at_nodes(
-        self, problem: OptimalControlProblem, nodes: Integers, by_state: Floats, by_controls: Floats | None
-    ) -> tuple[Integers, Floats]:
+    def _at_nodes(self, nodes: Integers, by_state: Floats, by_controls: Floats | None) -> tuple[Integers, Floats]:
         """Indices and derivatives of rows, each (P, Z), from those (K, rows, 2n) in (q, v) of nodes and of controls."""
-        layout, hold = self.layout, problem.hold
-        of_x = by_state @ self._velocity[nodes]
-        whole = by_controls is not None or hold > 1
-        # The node at the end of a stage is a variable of its own; at the end of the horizon no stage begins.
-        k = np.minimum(nodes // hold, layout.stages - 1) if whole else nodes
-        at = layout.in_stage(k) if whole else layout.state(k)
-        J = np.zeros((*of_x.shape[:2], at.shape[1]))
-        J[:, :, : layout.states] = of_x
-        if by_controls is not None:
-            J[:, :, layout.states :] = by_controls
-        if hold > 1:
-            last = nodes == problem.steps
-            J = J @ np.where(
-                last[:, None, None], np.eye(at.shape[1]), self._within[np.minimum(nodes, problem.steps - 1)]
-            )
-            at = np.where(last[:, None], -1, at)
-            at[last, : layout.states] = layout.state(np.array([layout.stages]))
-        return np.repeat(at, by_state.shape[1], axis=0), J.reshape(-1, at.shape[1])
+        of_x, layout = by_state @ self.steps.slopes[nodes], self.layout
+        if by_controls is None:
+            at, J = layout.state(nodes), of_x
+        else:
+            at, J = layout.in_stage(nodes), np.concatenate([of_x, by_controls], axis=2)
+        return np.repeat(at, J.shape[1], axis=0), J.reshape(-1, J.shape[2])
 
     def change(self, z: Floats) -> tuple[float, float]:
         """The slope of the cost along z, and its change at z by the quadratic model."""
@@ -261,23 +541,3 @@ class Stages(Frozen):
         moved = np.where(at >= 0, padded[at], 0.0)
         found: Floats = (self.J @ moved[:, :, None])[:, :, 0] - z[self.layout.state(k + 1)]
         return found
-
-
-def _condensed(J: Floats, gradient: Floats, hessian: Floats, hold: int) -> tuple[Floats, Floats, Floats, Floats]:
-    """Steps (N, ...) whose control is held over some of them, as stages (R, ...).
-
-    Returns the variables of each step in those of its stage (N, Z, Z), and J, gradient and Hessian of the stages.
-    """
-    N, x, Z = J.shape
-    R = N // hold
-    J, gradient, hessian = (part.reshape(R, hold, *part.shape[1:]) for part in (J, gradient, hessian))
-    within = np.empty((R, hold, Z, Z))
-    T = np.tile(np.eye(Z), (R, 1, 1))
-    total, curved = np.zeros((R, Z)), np.zeros((R, Z, Z))
-    for j in range(hold):
-        within[:, j] = T
-        across = np.swapaxes(T, 1, 2)
-        total += (across @ gradient[:, j, :, None])[:, :, 0]
-        curved += across @ hessian[:, j] @ T
-        T = np.concatenate([J[:, j] @ T, T[:, x:]], axis=1)
-    return within.reshape(N, Z, Z), T[:, :x], total, curved

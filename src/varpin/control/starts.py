@@ -9,8 +9,8 @@ import numpy as np
 
 from varpin import core
 from varpin.arrays import Floats
-from varpin.control.feedback import around
 from varpin.control.problem import OptimalControlProblem
+from varpin.control.rollout import around
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, VarpinError
 from varpin.linearization import node_jets

@@ -1,4 +1,4 @@
-"""Commands of a search's first motion, and those of an earlier plan."""
+"""Commands of a plan's motions: feedback around a motion, given controls, and an earlier plan shifted."""
 
 from __future__ import annotations
 
@@ -8,15 +8,49 @@ from typing import Any
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.along import states
-from varpin.control.feedback import held
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution, rest_of
 from varpin.core.arrays import Commands
 from varpin.errors import InputError
 from varpin.mechanics.scene import closest_controls
+from varpin.signals.commands import open_line, open_loop
 from varpin.signals.policy import LinearPolicy
 from varpin.support.checks import JointValues, as_floats, control_array, finite_array
+
+
+def around(problem: OptimalControlProblem, u: Floats, x: Floats, gains: Floats, previous: Floats | None) -> Commands:
+    """Controls u (R, m) with feedback around the states x before each decision.
+
+    Args:
+        problem: The problem.
+        u: The controls without feedback.
+        x: States (R, 2n); (R - 1, 2n) with linear controls, the first of which is given.
+        gains: Gains (R, m, 2n) on the states.
+        previous: Gains (R, m, m) on the previous control, around ``u``; None without.
+    """
+    if previous is not None:
+        gains = np.concatenate([gains, previous], axis=2)
+        # The control before the first one is given.
+        before = u[:-1] if problem.linear else np.vstack([u[:1], u[:-1]])
+        x = np.hstack([x, before])
+    if problem.linear:
+        return held(u, problem)._replace(gains=np.ascontiguousarray(gains[1:]), reference=np.ascontiguousarray(x))
+    return Commands(
+        u=u,
+        gains=np.ascontiguousarray(gains),
+        reference=np.ascontiguousarray(x),
+        hold=problem.hold,
+        limits=problem.control_limits,
+        before=np.zeros((0, problem.scene.controls)),
+    )
+
+
+def held(u: Floats, problem: OptimalControlProblem) -> Commands:
+    """Controls u (R, m) without feedback, within their limits."""
+    if problem.linear:
+        within = problem.begun(np.clip(u, *problem.control_limits))
+        return open_line(within, problem.integrator.stage_times)._replace(limits=problem.control_limits.copy())
+    return open_loop(u)._replace(hold=problem.hold, limits=problem.control_limits.copy())
 
 
 def first_commands(problem: OptimalControlProblem, controls: JointValues | LinearPolicy | Solution | None) -> Commands:
@@ -70,36 +104,10 @@ def _rows_of(problem: OptimalControlProblem, controls: Any) -> Floats:
 
 def shifted_commands(problem: OptimalControlProblem, previous: Solution, decisions: int) -> Commands:
     """The commands of :meth:`Solution.shifted`, with the problem's limits and its previous control."""
-    old, before = previous.problem, None if problem.rate is None else problem.rate.before
-    R, m = problem.decisions, problem.scene.controls
-    same = (
-        old.scene is problem.scene
-        and old.integrator == problem.integrator
-        and old.control_limits is problem.control_limits
-    )
-    if problem.linear:
+    old, means = previous.problem, None
+    if problem.linear and old.constraints and not any(item.of_controls for item in old.bound_constraints):
         # Within constraints the last control often leaps, which does not fit beyond the end, where the motion goes on
         # with the torques that hold the robot there. Limits of their rate keep controls from leaping.
-        leaps = bool(old.constraints) and not any(item.of_controls for item in old.bound_constraints)
-        means = closest_controls(problem.scene, previous.trajectory.q[-1]) if leaps else None
-        return first_commands(problem, rest_of(previous, previous.policy, decisions, before, means=means))
-    if not (same and (old.dt, old.steps, old.hold) == (problem.dt, problem.steps, problem.hold)):
-        return first_commands(problem, previous.shifted(decisions, before))
-    rows = np.minimum(np.arange(R) + decisions, R - 1)
-    u, gains, reference = previous.controls, previous.gains, states(old, previous.trajectory)[: -1 : old.hold]
-    if previous.previous_gains is not None:
-        start = None if old.rate is None else old.rate.before
-        expected = np.vstack([u[:1] if start is None else start, u[:-1]])[rows[:1]]
-        gains = np.concatenate([gains, previous.previous_gains], axis=2)
-        # A repeated control has itself as its previous one.
-        reference = np.hstack([reference[rows], np.vstack([expected, u[rows[:-1]]])])
-    else:
-        reference = reference[rows]
-    return Commands(
-        u=u[rows],
-        gains=gains[rows],
-        reference=reference,
-        hold=problem.hold,
-        limits=problem.control_limits,
-        before=np.zeros((0, m)) if before is None else before[None].copy(),
-    )
+        means = closest_controls(problem.scene, previous.trajectory.q[-1])
+    before = None if problem.rate is None else problem.rate.before
+    return first_commands(problem, rest_of(previous, previous.policy, decisions, before, means=means))

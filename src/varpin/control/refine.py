@@ -1,0 +1,235 @@
+"""Plans to a wished true cost: the step is halved, each time from the plan before, until the loss is small."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from varpin.control.history import Refined, Refinement, Status, part
+from varpin.control.multipliers import FEASIBLE, REPORTED
+from varpin.control.problem import OptimalControlProblem
+from varpin.control.solution import Solution
+from varpin.control.verification import excess, true_costs
+from varpin.errors import VarpinError
+from varpin.simulation.spectrum import rate_at_rest
+from varpin.trajectory import Trajectory
+
+logger = logging.getLogger(__name__)
+
+# Tolerance of the searches, accuracy of true costs and change of the cost that does not count, relative to the wish.
+SUFFICIENT, _KNOWN = 0.01, 0.1
+# Greatest number of halvings of the step.
+_HALVINGS = 10
+# Greatest violation of a constraint on the continuous system, relative to its range.
+_HOLDS = 0.1 * REPORTED
+# Halvings that have to lower the violation, the loss or the excess by this factor, on steps that resolve dampers and
+# dry friction: whose rate times the step is no more than that. A search that has ended otherwise than with its last
+# iteration gets one of them.
+_PATIENCE, _LOWER, _RESOLVED = 3, 0.9, 2.0
+# Bounds on the factor by which half the step lowers the excess of planned costs over the optimum: of smooth motions on
+# coarse grids (on fine ones it is 0.25), and of controls that reach their limits.
+_FALLS = (0.4, 0.5)
+
+Search = Callable[[OptimalControlProblem, Trajectory | None], Solution]
+
+
+class _Best(NamedTuple):
+    """The best plan so far, its step, and what it violates on the continuous system."""
+
+    rank: tuple[int, float]
+    solution: Solution
+    chosen: int
+    beyond: str
+
+
+def refine(problem: OptimalControlProblem, search: Search, wish: float, time_left: Callable[[], float]) -> Solution:
+    """Plan with the problem's step, then halve it, each time from the plan before, until the loss is small.
+
+    A plan whose loss is within the wish, and that keeps to the constraints on the continuous system, is compared with
+    the plan of half the step, which is the next one where that is cheaper by more than the wish.
+
+    Args:
+        problem: The problem with the coarsest step.
+        search: Makes a plan from a motion; interrupted, it returns one with status INTERRUPTED.
+        wish: Greatest allowed :attr:`Verification.closed_loop_loss`, and excess over the optimum.
+        time_left: Returns the time left [s].
+    """
+    tried: list[Refined] = []
+    best: _Best | None = None
+    finer: Solution | None = None
+    start: Trajectory | None = None
+    least, since = (9, np.inf), 0
+    while True:
+        began, doing = time.perf_counter(), f"with dt = {problem.dt:g} s"
+        try:
+            solution = search(problem, start) if finer is None else finer
+            if solution.status is Status.INTERRUPTED:
+                best = best or _Best((9, 0.0), solution, 0, "")
+                raise KeyboardInterrupt
+            plan = problem, solution.trajectory, solution.cost, solution.policy_on
+            found = true_costs(*plan, wish=wish, accuracy=_KNOWN * wish)
+            row = Refined(
+                dt=problem.dt,
+                steps=problem.steps,
+                cost=solution.cost,
+                true_cost=found.closed,
+                open_loop_cost=found.opened,
+                loss=excess(found.closed, solution.cost) if found.known else np.nan,
+                iterations=solution.iterations,
+                status=solution.status,
+                seconds=time.perf_counter() - began,
+                violation=found.violation,
+            )
+            tried.append(row)
+            kind, value = _failing(row, solution, wish)
+            rank = kind, value if kind else row.true_cost
+            if best is None or rank < best.rank:
+                best = _Best(rank, solution, len(tried) - 1, found.where if kind >= 2 else "")
+            finer, spent = None, _spent(tried, time_left())
+            doing = f"with half of dt = {problem.dt:g} s"
+            half, fails = _halved(problem)
+            if kind == 0 and not spent:
+                value = _barely_above(tried, wish)
+                if half is not None and not np.isfinite(value):
+                    finer = search(half, _motion_of(solution, half))
+                    if finer.status is Status.INTERRUPTED:
+                        raise KeyboardInterrupt
+                    value = _above(tried, solution, finer)
+                tried[-1] = replace(row, excess=value, seconds=time.perf_counter() - began)
+                if value <= wish or (finer is None and not np.isfinite(value)):
+                    return _recorded(solution, wish, tried, len(tried) - 1, "", met=True)
+            if kind < least[0] or (kind == least[0] and value < _LOWER * least[1]):
+                least, since = (kind, value), len(tried) - 1
+            ended = spent or _stuck(problem, solution, tried, since, kind) or fails
+            if ended:
+                return _given_up(best, wish, tried, ended)
+            assert half is not None
+            start, problem = _motion_of(solution, half) if finer is None else None, half
+        except VarpinError as error:
+            if best is None:
+                raise
+            return _given_up(best, wish, tried, f"{doing} there is no plan: {error}")
+        except KeyboardInterrupt:
+            if best is None:
+                raise
+            interrupted = replace(best.solution, status=Status.INTERRUPTED, reason=f"interrupted {doing}")
+            return _given_up(best._replace(solution=interrupted), wish, tried, interrupted.reason)
+
+
+def _motion_of(coarse: Solution, problem: OptimalControlProblem) -> Trajectory:
+    """The motion of a plan in half its steps."""
+    return problem.simulate(coarse.policy_on("momentum" if problem.integrator.variational else "velocity", 2))
+
+
+def _halved(problem: OptimalControlProblem) -> tuple[OptimalControlProblem | None, str]:
+    """The problem with half the step, held controls with their period; or why there is none."""
+    hold = problem.hold if problem.hold == 1 else 2 * problem.hold
+    try:
+        return problem.at(dt=0.5 * problem.dt, steps=2 * problem.steps, hold=hold), ""
+    except VarpinError as error:
+        return None, f"with half of dt = {problem.dt:g} s there is no plan: {error}"
+
+
+def _failing(row: Refined, solution: Solution, wish: float) -> tuple[int, float]:
+    """What a plan lacks, and how much of it.
+
+    Constraints (3), constraints on the continuous system (2), a known loss within the wish or convergence (1), or
+    nothing (0).
+    """
+    if solution.violation > FEASIBLE:
+        return 3, solution.violation
+    if not row.violation <= _HOLDS:
+        return 2, row.violation if np.isfinite(row.violation) else np.inf
+    if not abs(row.loss) <= wish or not solution.status.converged:
+        return 1, abs(row.loss) if np.isfinite(row.loss) else np.inf
+    return 0, np.inf
+
+
+def _spent(tried: list[Refined], left: float) -> str:
+    """Why the step may not be halved; empty if it may."""
+    if left <= 0.0:
+        return f"the time limit came after dt = {tried[-1].dt:g} s"
+    return f"the step has been halved {_HALVINGS} times" if len(tried) > _HALVINGS else ""
+
+
+def _stuck(problem: OptimalControlProblem, solution: Solution, tried: list[Refined], since: int, kind: int) -> str:
+    """Why halving on would gain nothing, as the last gain was ``since``; empty if it may."""
+    status, without = solution.status, len(tried) - 1 - since
+    if not status.converged and without >= (_PATIENCE if status is Status.MAX_ITERATIONS else 1):
+        if status is Status.INFEASIBLE:
+            return f"with dt = {problem.dt:g} s there is no plan within the constraints: {solution.reason}"
+        return f"for {without + 1} steps in a row the searches ended {status.name}"
+    if without < _PATIENCE or problem.dt * rate_at_rest(problem.scene, problem.q0) > _RESOLVED:
+        return ""
+    what = ("excess over finer controls", "loss", "violation", "violation")[kind]
+    return f"the last {_PATIENCE} halvings of the step have not lowered the {what}"
+
+
+def _barely_above(tried: list[Refined], wish: float) -> float:
+    """Excess of the last row, where the halving before has hardly changed the cost; else infinite."""
+    if len(tried) < 2 or not all(row.status.converged for row in tried[-2:]):
+        return np.inf
+    last, gained = tried[-1], tried[-2].cost - tried[-1].cost
+    if abs(gained) > _KNOWN * wish * abs(last.cost):
+        return np.inf
+    return _over_known(tried, excess(last.true_cost, last.cost - max(gained, 0.0)))
+
+
+def _above(tried: list[Refined], solution: Solution, finer: Solution) -> float:
+    """Excess of the last row over the optimum of finer controls by a plan with half the step; infinite if unknown.
+
+    A search that has not converged only tells something where it found a cheaper plan within the constraints.
+    """
+    if finer.violation > FEASIBLE or (not finer.status.converged and finer.cost >= solution.cost):
+        return np.inf
+    optimum = finer.cost
+    if not finer.status.converged and finer.history:
+        optimum -= max(finer.history[-1].expected_decrease, 0.0)
+    # Finer controls lower the planned cost further, by a geometric series.
+    gained, falls = tried[-1].cost - optimum, _FALLS[0]
+    if len(tried) > 1 and tried[-2].cost > tried[-1].cost:
+        falls = float(np.clip(gained / (tried[-2].cost - tried[-1].cost), *_FALLS))
+    # Where the cost has fallen to a fraction, that says nothing about further falls.
+    further = max(gained, 0.0) * falls / (1.0 - falls) if gained < abs(optimum) else 0.0
+    return _over_known(tried, excess(tried[-1].true_cost, optimum - further))
+
+
+def _over_known(tried: list[Refined], above: float) -> float:
+    """The excess of the last row, at least that over the true costs of other steps that keep to the constraints."""
+    others = [row.true_cost for row in tried if row.violation <= _HOLDS and np.isfinite(row.loss)]
+    return max([above, *(excess(tried[-1].true_cost, other) for other in others)])
+
+
+def _given_up(best: _Best, wish: float, tried: list[Refined], ended: str) -> Solution:
+    """The best plan of a refinement that has not met the wish."""
+    reason = f"true_cost = {wish:g} is not met: {ended}"
+    if tried:
+        row = tried[best.chosen]
+        lost = f"the best plan loses {part(row.loss)}" if np.isfinite(row.loss) else "no plan's true cost is known"
+        reason += f"; {lost} at dt = {row.dt:g} s"
+        if best.beyond:
+            reason += f", and on the continuous system {best.beyond}"
+        if wish < row.excess < np.inf:
+            reason += f", and costs about {part(row.excess)} more than the optimum of finer controls"
+    return _recorded(best.solution, wish, tried, best.chosen, reason)
+
+
+def _recorded(
+    solution: Solution, wish: float, tried: list[Refined], chosen: int, reason: str, *, met: bool = False
+) -> Solution:
+    """The solution with the record of its refinement."""
+    total = sum(row.seconds for row in tried) or 1.0
+    rows = tuple(replace(row, share=row.seconds / total) for row in tried)
+    if met:
+        row, compared = rows[chosen], "not compared with finer controls"
+        if np.isfinite(row.excess):
+            above = f"about {part(row.excess)} above the optimum of finer controls"
+            compared = above if row.excess > 0.0 else "half the step is not cheaper"
+        reason = f"dt = {row.dt:g} s loses {part(row.loss)}, within {part(wish)[1:]}; {compared}"
+    logger.log(logging.INFO if met else logging.WARNING, "%s: %s", solution.problem.scene.robot.name, reason)
+    return replace(solution, refinement=Refinement(wish, met, rows, chosen, reason))

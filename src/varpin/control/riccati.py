@@ -1,0 +1,219 @@
+"""The backward recursion along a motion: feedback, the change of the controls, the foreseen decrease, and noise costs.
+
+Equation (O2) of docs/mathematics.md. Where the recursion loses too many digits, the value function is kept as a sum of
+squares (1/2) |R x + r|^2, without its Hessian R'R: see ``square_root.hpp`` in ``src/core``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from varpin import core
+from varpin.arrays import Floats, Mask
+from varpin.control.problem import OptimalControlProblem
+from varpin.control.stages import Layout, Recursion, Steps
+from varpin.integrators.base import noise_fields
+from varpin.linearization import velocity_at_nodes, velocity_curvature
+from varpin.support.frozen import Frozen
+from varpin.trajectory import Trajectory
+
+# Greatest relative rounding error of Quu; above, the pass is repeated on square roots.
+TRUSTED = 1e-9
+# Size of eigenvalues that are rounding errors in a Hessian with unit diagonal.
+_ROUNDING = 1e-12
+# The sampling rule of a cost in z at the beginning of the step.
+_RULE: Floats = np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
+_RULE.setflags(write=False)
+
+
+class Plan(NamedTuple):
+    """The result of a backward pass: gains, feed-forward changes of the controls, and the expected decrease."""
+
+    feedforward: Floats  # (R, m)
+    gains: Floats  # (R, m, X) on the states of the recursion
+    states: int  # 2n
+    gradient: Floats  # (R, m)
+    slope: float
+    noise: float  # cost of the noise along the motion
+    jumps: Floats  # (N, 2n, n), empty without noise
+    spread: Floats  # (N, 2n, 2n), likewise: Hessians in the noise's effect on the state after each step
+    loss: float  # estimated relative rounding error of Quu, or of its root
+    factors: Floats  # (R, m, m) L D L' of the regularized Quu
+
+    @property
+    def feedback(self) -> Floats:
+        """Gains (R, m, 2n) on the state."""
+        return self.gains[:, :, : self.states]
+
+    @property
+    def previous(self) -> Floats | None:
+        """Gains (R, m, m) on the previous control, with a rate cost or linear controls."""
+        x, (_, m, X) = self.states, self.gains.shape
+        return self.gains[:, :, x : x + m] if x < X else None
+
+    @property
+    def expected_decrease(self) -> float:
+        """Decrease of the expected cost with a full step, by the model."""
+        # The step is the model's minimum, where the curvature is -slope.
+        return -0.5 * self.slope
+
+
+def backward(
+    steps: Steps, regularization: float, *, curvature: Floats | None = None, fixed: Mask | None = None
+) -> Plan | None:
+    """The plain recursion, or, where its rounding errors are large and the model is convex, that on square roots.
+
+    None where the model has no minimum.
+
+    Args:
+        steps: The steps of the motion.
+        regularization: Relative to the diagonal of Quu.
+        curvature: Second derivatives (N, Z, Z) of the steps in the cost to go, where they count.
+        fixed: Which controls (R, m) stay as they are.
+    """
+    expanded = steps.recursion(curvature, fixed)
+    plain = _pass(steps, expanded, regularization, second=curvature is not None, roots=False)
+    if curvature is not None or (plain is not None and plain.loss <= TRUSTED):
+        return plain
+    return _pass(steps, expanded, regularization, second=False, roots=True) or plain
+
+
+def _pass(steps: Steps, given: Recursion, regularization: float, *, second: bool, roots: bool) -> Plan | None:
+    """One recursion, on square ``roots`` or not; with ``second`` derivatives, those of the last velocity count, too."""
+    problem, end, motion = steps.problem, steps.terminal, steps.trajectory
+    (S, X, Z), (N, x, _), k = given.J.shape, steps.J.shape, given.G.shape[2]
+    m, R = Z - X, problem.decisions
+    gradient, hessian = np.zeros(X), np.zeros((X, X))
+    gradient[:x], hessian[:x, :x] = end.gradient, end.hessian
+    if second and problem.integrator.variational:
+        pull = end.cost.gradient[:, x // 2 :]
+        hessian[:x, :x] += velocity_curvature(problem.scene, motion.q[-1:], motion.v[-1:], pull)[0]
+    found: core.BackwardPass | core.RootPass = core.BackwardPass(m, gradient, hessian)
+    squares: tuple[core.Squares, ...] = ()
+    if roots:
+        final, running = squares_of(end.cost.gradient, end.cost.hessian), squares_of(given.gradient, given.hessian)
+        if final is None or running is None:
+            return None
+        found, squares = core.RootPass(m, final.after(end.slopes).padded(X).core, gradient), (running.core,)
+    feedforward, gains, by_controls = np.empty((R, m)), np.empty((R, m, X)), np.empty((R, m))
+    spread, factors = np.empty((S if k else 0, X, X)), np.empty((R, m, m))
+    failed = found.run(
+        problem.dt,
+        problem.hold,
+        float(regularization),
+        core.ExpandedSteps(
+            A=np.ascontiguousarray(given.J[:, :, :X]),
+            B=np.ascontiguousarray(given.J[:, :, X:]),
+            G=given.G,
+            Gx=np.ascontiguousarray(given.Gz[..., :X]),
+            Gu=np.ascontiguousarray(given.Gz[..., X:]),
+            rule=_RULE,
+            gradient=given.gradient,
+            hessian=given.hessian,
+            velocity=np.zeros((0, X // 2, X)),
+            curvature=np.zeros((0, Z, Z)),
+            rate=np.zeros((0, m, m)),
+            pull=np.zeros((0, m)),
+        ),
+        core.Gains(
+            feedforward=feedforward,
+            feedback=gains,
+            previous=np.empty((0, m, m)),
+            control_gradient=by_controls,
+            costate=np.empty((0, X)),
+            spread=spread,
+            factors=factors,
+        ),
+        *squares,
+    )
+    if failed >= 0 or not (math.isfinite(found.slope) and math.isfinite(found.curvature)):
+        return None
+    jumps, noise = np.empty((0, x, x // 2)), found.noise
+    spread = spread[:, :x, :x]
+    if k:
+        jumps, G, spread = steps.lin.J, steps.lin.G, spread[S - N :] + steps.kicked
+        noise += 0.5 * float((G * (steps.kicked @ G)).sum())
+    return Plan(feedforward, gains, x, by_controls, found.slope, noise, jumps, spread, found.loss, factors)
+
+
+def foreseen(steps: Steps, plan: Plan) -> tuple[Floats, bool]:
+    """The changes of the variables of :class:`Layout` under a plan, by the linear model, clipped to control limits.
+
+    Also whether a control reaches a limit.
+    """
+    problem, given = steps.problem, steps.recursion(None, None)
+    (S, X, Z), layout = given.J.shape, Layout.of(problem)
+    R, m = plan.feedforward.shape
+    A, B = (np.ascontiguousarray(part) for part in (given.J[:, :, :X], given.J[:, :, X:]))
+    slack = steps.slack if problem.limited else np.zeros((0, 2, m))
+    expected, moves, after = np.empty((R, Z)), np.empty((R, m)), np.empty((S, X))
+    fixed = plan.feedforward, plan.gains, np.zeros((0, m, m)), slack
+    limited = core.foresee(problem.hold, A, B, *fixed, np.zeros(Z), expected, moves, after)
+    x = np.vstack([np.zeros((1, layout.states)), after[:, : layout.states]])
+    return layout.joined(x[-layout.stages - 1 :], moves), limited
+
+
+def noise_shares(problem: OptimalControlProblem, motion: Trajectory, plan: Plan) -> Floats:
+    """Noise cost of each step of a motion (N,), with the noise's effect and value function of the plan's own motion.
+
+    Empty where there is no noise.
+    """
+    if problem.processes == 0:
+        return np.zeros(0)
+    scene, n, left = problem.scene, problem.scene.robot.dof, problem.integrator.left
+    q, v = motion.q, motion.v
+    jump = noise_fields(scene, motion, q[:-1], v[:-1], problem.q0).F
+    if not problem.integrator.variational:
+        jump = velocity_at_nodes(scene, q[:-1], v[:-1])[:, :, n:] @ jump
+    g = left * (plan.jumps @ jump)
+    if left < 1.0:
+        g[:, n:] += (1.0 - left) * noise_fields(scene, motion, q[1:], v[1:], problem.q0).F
+    added: Floats = 0.5 * np.einsum("Nai,Nai->N", g, plan.spread @ g)
+    return added
+
+
+@dataclass(frozen=True, eq=False)
+class Squares(Frozen):
+    """N convex functions (1/2) |L z + r|^2 + c . z, up to constants."""
+
+    root: Floats  # L (N, z, z), or (1, z, z) for all
+    shift: Floats  # r (N, z)
+    linear: Floats  # c (N, z)
+
+    def after(self, D: Floats) -> Squares:
+        """The functions of x with z = D x."""
+        return Squares(self.root @ D, self.shift, self.linear @ D)
+
+    def padded(self, size: int) -> Squares:
+        """The same functions of ``size`` variables."""
+        more = size - self.shift.shape[1]
+        root = np.pad(self.root, ((0, 0), (0, more), (0, more)))
+        return Squares(root, *(np.pad(part, ((0, 0), (0, more))) for part in (self.shift, self.linear)))
+
+    @property
+    def core(self) -> core.Squares:
+        """The squares as an object of the compiled core."""
+        return core.Squares(self.root, self.shift, self.linear)
+
+
+def squares_of(gradient: Floats, hessian: Floats) -> Squares | None:
+    """Squares from ``gradient`` (N, z) and ``hessian`` (N, z, z) or (1, z, z); None if one is not semidefinite.
+
+    The linear part has only the gradient's component in the Hessian's null space: in squares a gradient keeps its
+    digits.
+    """
+    size = np.sqrt(np.abs(np.diagonal(hessian, axis1=-2, axis2=-1)))
+    unit = np.where(size > 0.0, size, 1.0)
+    values, vectors = np.linalg.eigh(hessian / (unit[..., :, None] * unit[..., None, :]))
+    if not (values >= -_ROUNDING).all():
+        return None
+    weight, known = np.sqrt(np.maximum(values, 0.0)), values > _ROUNDING
+    across = np.swapaxes(vectors, -1, -2)
+    along = (across @ (gradient / unit)[..., None])[..., 0]
+    shift = np.where(known, along / np.where(known, weight, 1.0), 0.0)
+    linear = unit * (vectors @ np.where(known, 0.0, along)[..., None])[..., 0]
+    return Squares(weight[..., :, None] * across * unit[..., None, :], shift, linear)
