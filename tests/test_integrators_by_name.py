@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from refusals import refused
 
 import varpin as vp
-from varpin.integrators import BY_NAME, integrator_of, options_of
+from varpin.integrators import BY_NAME, integrator_of
 from varpin.io.scenefile.kinds import INTEGRATORS
 
 MADE = [
@@ -60,7 +60,6 @@ def test_every_integrator_is_known_and_has_a_name_in_scene_files():
     assert set(BY_NAME.values()) == own - {vp.Integrator}
     names = ["midpoint", "gauss", "radau", "explicit_euler", "semi_implicit_euler", "runge_kutta_4"]
     assert list(INTEGRATORS) == names
-    assert options_of(vp.Reference) == ("rtol", "atol")
     assert integrator_of(" Gauss(3, kick='split') ") == vp.Gauss(3, kick="split")
 
 

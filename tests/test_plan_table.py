@@ -428,7 +428,7 @@ def test_torques_of_a_loop_with_a_limit_of_the_rate_do_not_jump():
     assert steps.max() > 39.0
     # Plans of three iterations violate the limit a little; what is applied does not.
     assert steps.max() <= 40.0 * (1.0 + 1e-9)
-    assert run.constraints[0].worst <= 1e-9
+    assert run.constraints[0].violation <= 1e-9
     ends = np.array([plan.controls[:2] for plan in run.plans])
     np.testing.assert_allclose(ends[0, 0], hold, atol=1e-12)
     np.testing.assert_allclose(ends[1:, 0], ends[:-1, 1], atol=1e-4)

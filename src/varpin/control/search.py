@@ -508,7 +508,7 @@ class Search:
         return more is not None
 
     def _line_search(self) -> Taken:
-        """Move to the trial along the step that a line search accepts, if any."""
+        """Move to the trial along the step whose merit, (O11), a line search accepts, if any."""
         step, noise, problem, motion = self._known, self.noise, self.problem, self.trajectory
         assert noise is not None
         z = None if step.minimum is None else step.minimum.z
