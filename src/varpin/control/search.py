@@ -503,7 +503,7 @@ class Search:
         self.counts += 1
         more = None
         with contextlib.suppress(VarpinError):
-            more = widened(self.solution(Status.CONVERGED), self.deadline)
+            more = widened(self.solution(Status.CONVERGED))
         self.added = self.added if more is None else more
         return more is not None
 
