@@ -249,14 +249,6 @@ def test_rates_that_are_no_controls_are_refused(rate):
         core.Mechanism.make(**of_mechanism(own) | {"constraints": rows})
 
 
-def test_terms_after_a_watch_are_refused():
-    costs = core.CostTerms.make(1, 1)
-    watch = core.Watch(costs, np.ones((1, 9)), np.zeros((2, 1)), np.zeros((2, 1)), np.zeros((1, 1)), np.zeros((1, 0)))
-    costs.add_term(core.Subject.entries, 0, np.eye(3), np.zeros((1, 3)), np.zeros(0, dtype=np.int64))
-    with refused(ValueError, "terms"):
-        watch.after(0, 1)
-
-
 @pytest.mark.parametrize("level", [0, 63])
 def test_parts_that_no_step_has_are_refused(level):
     given = {**steps(scene()), "halvings": np.array([1, 1, 2, 2, 2, level], dtype=np.uint8)}

@@ -108,8 +108,6 @@ def meshed():
 def test_meshes_stay_at_home(meshed):
     scene, shipping = vp.Scene(meshed, noise=vp.AdditiveNoise(0.1)), Shipping()
     run(scene, executor=shipping)
-    options = {"duration": 0.02, "integrators": [vp.Midpoint()], "dts": [0.01], "repeats": 1}
-    vp.work_precision(vp.Scene(meshed), [0.5, 0.2], [0.0, 0.0], executor=shipping, **options)
     assert shipping.most < 50_000
     assert scene.robot.visuals is not None
 
@@ -158,27 +156,6 @@ def test_monte_carlo_tells_of_what_its_paths_do(caplog):
         assert f"warning: {warning}" in str(found)
     assert f"{len(found.warnings)} warning" in repr(found)
     assert about(found._repr_html_(), "error")
-
-
-def test_work_and_precision_on_processes(spawned):
-    scene = vp.Scene(vp.planar_chain(2))
-    options = {
-        "duration": 0.2,
-        "integrators": [vp.Midpoint(), vp.RungeKutta4()],
-        "dts": [0.02, 0.01],
-        "repeats": 1,
-    }
-    calls = []
-    here = vp.work_precision(scene, [0.5, 0.2], [0.0, 0.0], **options)
-    there = vp.work_precision(
-        scene, [0.5, 0.2], [0.0, 0.0], executor=spawned, progress=lambda *done: calls.append(done), **options
-    )  # fmt: skip
-    assert calls == [(k, 4) for k in range(1, 5)]
-    assert [(run.integrator, run.dt, run.error) for run in there.runs] == [
-        (run.integrator, run.dt, run.error) for run in here.runs
-    ]
-    with refused(vp.InputError, "executor", "concurrent.futures.Executor"):
-        vp.work_precision(scene, [0.5, 0.2], [0.0, 0.0], executor=3, **options)
 
 
 class Silent(Executor):

@@ -253,7 +253,7 @@ def test_q0_takes_the_way_that_the_page_says(monkeypatch):
             called.append((path.relative_to(root).as_posix(), frame.f_code.co_name))
 
     def asked(*given):
-        called.append(("look.hpp", "pulls_fast"))
+        called.append(("checks.hpp", "pulls_fast"))
         return pulls_fast(*given)
 
     monkeypatch.setattr(choice, "pulls_fast", asked)
@@ -267,4 +267,4 @@ def test_q0_takes_the_way_that_the_page_says(monkeypatch):
     for place in way:
         if place[0].endswith(".py") or place in called:
             assert place in rest, place
-    assert ("look.hpp", "pulls_fast") in way
+    assert ("checks.hpp", "pulls_fast") in way

@@ -655,6 +655,14 @@ def target_of(file):
     return file._task.terms[0].target
 
 
+def test_an_option_of_solve_is_refused_with_its_key(tmp_path):
+    file = vp.load_scene(write(tmp_path, changed("max_iterations = 5", "max_iterations = 5\ntolerance = -1.0")))
+    with refused(vp.SceneFileError, "solve.tolerance", "-1.0"):
+        file.solve()
+    with refused(vp.InputError, "tolerance", "-2.0"):
+        file.solve(tolerance=-2.0)
+
+
 def test_waypoints(tmp_path):
     waypoints = "times = [0.0, 0.05, 0.1], values = [[0, 0, 0], [1, 2, 0], [1, 0, 0]]"
     lines = target_of(vp.load_scene(write(tmp_path, tracked(f"{{ {waypoints} }}"))))

@@ -8,7 +8,6 @@ import pytest
 from refusals import refused
 
 import varpin as vp
-from varpin import trajectory
 from varpin.core import Steps
 from varpin.signals.commands import open_loop
 from varpin.trajectory import chained
@@ -194,10 +193,8 @@ def test_parts_are_kept_however_a_motion_is_made():
     np.testing.assert_array_equal(before.statistics.halvings, expected.part(0, before.steps).halvings)
 
 
-@pytest.mark.parametrize("at_a_time", [1, 3, 1_000_000])
 @pytest.mark.parametrize("change", ["shorter", "longer", "other", "whole", "counts"])
-def test_parts_that_do_not_make_up_steps_are_refused(change, at_a_time, tmp_path, monkeypatch):
-    monkeypatch.setattr(trajectory, "_AT_A_TIME", at_a_time)
+def test_parts_that_do_not_make_up_steps_are_refused(change, tmp_path):
     scene, motion = moving("finger", vp.Midpoint(), 1)
     assert motion.statistics.damage() is None
     halvings, substeps = motion.statistics.halvings.copy(), motion.statistics.substeps.copy()

@@ -9,8 +9,7 @@
 #include "arrays.hpp"
 #include "bodies.hpp"
 #include "registrations.hpp"
-#include "varpin/stake.hpp"
-#include "watched.hpp"
+#include "varpin/decrease_bound.hpp"
 
 namespace varpin::border {
 
@@ -186,20 +185,20 @@ std::tuple<Out, Out> samples(In<2> rule, In<3> q, In<3> v) {
     return {sampled_q, sampled_v};
 }
 
-// Free and moved stake of models with gradients (N, k) and Hessians (N, k, k), or one (1, k, k), at points displaced by
-// `displacement` (N, k).
+// Free and moved bound of the decrease of models with gradients (N, k) and Hessians (N, k, k), or one (1, k, k), at
+// points displaced by `displacement` (N, k).
 std::tuple<double, double> stake_of(In<2> gradient, In<3> hessian, In<2> displacement) {
     const std::size_t rows = gradient.shape(0), size = gradient.shape(1);
     const bool one = hessian.shape(0) == 1;
     require(hessian, "hessian", {one ? 1 : rows, size, size});
     require(displacement, "displacement", {rows, size});
     nb::gil_scoped_release release;
-    Stake stake;
+    DecreaseBound bound;
     for (std::size_t s = 0; s < rows; ++s) {
-        stake.add(gradient.data() + s * size, hessian.data() + (one ? 0 : s * size * size),
+        bound.add(gradient.data() + s * size, hessian.data() + (one ? 0 : s * size * size),
                   displacement.data() + s * size, size);
     }
-    return {stake.free, stake.moved};
+    return {bound.free, bound.moved};
 }
 
 }  // namespace
@@ -220,25 +219,6 @@ void register_costs(nb::module_& m) {
         .def("values", &values, "q"_a, "v"_a, "u"_a)
         .def("expand", &expand, "q"_a, "v"_a, "u"_a)
         .def("expand_steps", &expand_steps, "rule"_a, "q"_a, "v"_a, "u"_a);
-    nb::class_<HeldWatch> watch(m, "Watch");
-    nb::enum_<Watch::Verdict>(watch, "Verdict")
-        .value("going", Watch::Verdict::going)
-        .value("cut", Watch::Verdict::cut)
-        .value("dear", Watch::Verdict::dear);
-    watch
-        .def(nb::init<const CostTerms&, In<2>, In<2>, In<2>, In<2>, InOut<2>>(), "costs"_a, "rule"_a, "q"_a, "v"_a,
-             "u"_a, "values"_a.noconvert(), nb::keep_alive<1, 2>())
-        .def(
-            "ask",
-            [](HeldWatch& watch, double weight, double most, std::ptrdiff_t from, double most_parts) {
-                watch.core.weight = weight;
-                watch.core.most = most;
-                watch.core.from = from;
-                watch.core.most_parts = most_parts;
-            },
-            "weight"_a, "most"_a, "after"_a, "parts"_a)
-        .def("after", &HeldWatch::after, "step"_a, "parts"_a)
-        .def_prop_ro("verdict", [](const HeldWatch& watch) { return watch.core.verdict; });
     m.def("change_values", &change_values, "weight"_a, "before"_a, "u"_a);
     m.def("expand_changes", &expand_changes, "weight"_a, "before"_a, "u"_a);
     m.def("stake_of", &stake_of, "gradient"_a, "hessian"_a, "displacement"_a);

@@ -14,7 +14,6 @@
 #include "arrays.hpp"
 #include "registrations.hpp"
 #include "rollout_arrays.hpp"
-#include "watched.hpp"
 
 namespace varpin::border {
 
@@ -156,12 +155,12 @@ bool first_nodes(BoundRollout& rollout, nb::handle nodes) {
 }
 
 void roll(BoundRollout& rollout, double dt, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes,
-          HeldWatch* watch, const std::optional<In<4>>& impulses) {
+          const std::optional<In<4>>& impulses) {
     ExplicitRollout& core = rollout.core;
     const double* kicks = impulses_of(*rollout.mechanism, impulses, nodes);
     roll_paths(*rollout.mechanism, static_cast<std::size_t>(core.paths()), core.abscissae(), commands, increments,
                drift, nodes, [&](const Commands& by, const double* dw, const double* more, const Nodes& to) {
-                   core.roll(dt, by, dw, more, kicks, to, watch ? watch->of(to) : nullptr);
+                   core.roll(dt, by, dw, more, kicks, to);
                });
 }
 
@@ -193,8 +192,7 @@ void register_explicit(nb::module_& m) {
             "v", [](BoundRollout& rollout) { return rollout.view(rollout.core.v); }, nb::rv_policy::reference_internal)
         .def("copy", [](const BoundRollout& rollout) { return BoundRollout(rollout); })
         .def("first_nodes", &first_nodes, "nodes"_a)
-        .def("roll", &roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a, "watch"_a.none() = nb::none(),
-             "impulses"_a = nb::none());
+        .def("roll", &roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a, "impulses"_a = nb::none());
     m.def("accelerations", &accelerations, "mechanism"_a, "q"_a, "v"_a, "force"_a);
     m.def("inverse_dynamics", &inverse_dynamics, "mechanism"_a, "q"_a, "v"_a, "a"_a);
     m.def("linearize_explicit", &linearize, "mechanism"_a, "method"_a, "dt"_a, "q"_a, "v"_a, "force"_a,

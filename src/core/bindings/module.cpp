@@ -11,6 +11,6 @@ NB_MODULE(_core, m) {
     varpin::border::register_backward(m);
     varpin::border::register_rollouts(m);
     varpin::border::register_constrained(m);
-    varpin::border::register_look(m);
+    varpin::border::register_checks(m);
     varpin::border::register_costs(m);
 }

@@ -11,7 +11,7 @@ void register_explicit(nanobind::module_& m);
 void register_backward(nanobind::module_& m);
 void register_rollouts(nanobind::module_& m);
 void register_constrained(nanobind::module_& m);
-void register_look(nanobind::module_& m);
+void register_checks(nanobind::module_& m);
 void register_costs(nanobind::module_& m);
 
 }  // namespace varpin::border

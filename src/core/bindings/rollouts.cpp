@@ -19,7 +19,6 @@
 #include "small_arms.hpp"
 #include "steps_at.hpp"
 #include "varpin/linearization.hpp"
-#include "watched.hpp"
 
 namespace varpin::border {
 
@@ -113,12 +112,12 @@ class Rollout {
         require(impulse, "impulse", {states_.size(), size()});
         const Turn stepper(*shared_);
         for (std::size_t i = 0; i < states_.size(); ++i) {
-            stepper->look_at(states_[i]);
+            stepper->factor_at(states_[i]);
             stepper->kick(impulse.data() + i * size(), states_[i]);
         }
     }
 
-    void roll(double h, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes, HeldWatch* watch,
+    void roll(double h, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes,
               const std::optional<In<4>>& impulses) {
         const Turn stepper(*shared_);
         if (impulses && constrained_ && !stepper->held)
@@ -127,7 +126,7 @@ class Rollout {
         roll_paths(*mechanism_, states_.size(), stages_, commands, increments, drift, nodes,
                    [&](const Commands& by, const double* dw, const double* more, const Nodes& to) {
                        stepper->guards = guards_;
-                       stepper->roll(h, by, dw, more, kicks, states_, to, watch ? watch->of(to) : nullptr);
+                       stepper->roll(h, by, dw, more, kicks, states_, to);
                    });
     }
 
@@ -234,7 +233,7 @@ void register_rollouts(nb::module_& m) {
         .def("fork", &Rollout::fork, "guards"_a, nb::keep_alive<0, 1>())
         .def("begin", &Rollout::begin, "q"_a, "v"_a)
         .def("roll", &Rollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a,
-             "watch"_a.none() = nb::none(), "impulses"_a = nb::none())
+             "impulses"_a = nb::none())
         .def("kick", &Rollout::kick, "impulse"_a)
         .def("nodes", &Rollout::nodes)
         .def("halvings", &Rollout::halvings, "path"_a)

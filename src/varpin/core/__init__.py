@@ -18,7 +18,6 @@ from varpin.core._core import Steps as Steps
 from varpin.core._core import Stretch as Stretch
 from varpin.core._core import Subject as Subject
 from varpin.core._core import Tableau as Tableau
-from varpin.core._core import Watch as Watch
 from varpin.core._core import accelerations as accelerations
 from varpin.core._core import change_values as change_values
 from varpin.core._core import constrained_derivatives as constrained_derivatives

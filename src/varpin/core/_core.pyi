@@ -105,32 +105,6 @@ class Guards:
         *, active: bool, branch_margin: float, energy_balance: float, energy_budget: float, most_halvings: int
     ) -> Guards: ...
 
-class Watch:
-    """The running cost of one path during its rollout, and whether to stop it early."""
-
-    class Verdict(Enum):
-        going = 0
-        cut = 1
-        dear = 2
-
-    def __init__(self, costs: CostTerms, rule: Floats, q: Floats, v: Floats, u: Floats, values: Floats) -> None:
-        """Watch nodes q and v (N + 1, n) and controls u (N, m), written during the rollout except the first node.
-
-        Writes the values of the terms at the samples of the rule (s, 9) into ``values`` (N s, terms).
-        """
-
-    def ask(self, weight: float, most: float, after: int, parts: float) -> None:
-        """Stop the motion when ``weight`` times the sum of its values exceeds ``most``.
-
-        The check begins after ``after`` steps. The motion also stops there if these steps have over ``parts`` parts.
-        """
-
-    def after(self, step: int, parts: int) -> bool:
-        """Account for a step with this number of parts; False to stop the motion."""
-
-    @property
-    def verdict(self) -> Verdict: ...
-
 class Rollout:
     """Paths of a variational integrator, under constraints where ``places`` are given.
 
@@ -162,12 +136,11 @@ class Rollout:
         increments: Floats,
         drift: Floats,
         nodes: RolloutArrays,
-        watch: Watch | None = None,
         impulses: Floats | None = None,
     ) -> None:
         """Take the steps of the commands, and write them into the nodes; both are named tuples of arrays.
 
-        A watch may stop a single path. ``impulses`` (P, N, 2, n), in addition to noise, are added to the momenta before
+        ``impulses`` (P, N, 2, n), in addition to noise, are added to the momenta before
         and after each step, or held over it as the noise; under constraints they have to be held.
         """
 
@@ -451,7 +424,6 @@ class ExplicitRollout:
         increments: Floats,
         drift: Floats,
         nodes: RolloutArrays,
-        watch: Watch | None = None,
         impulses: Floats | None = None,
     ) -> None:
         """All N steps of length dt [s] of all paths.

@@ -18,7 +18,7 @@ from varpin.mechanics.scene import Scene
 from varpin.signals.commands import lines, open_loop, rows, steps_of
 from varpin.signals.controls import Controls
 from varpin.signals.functions import ControlLaw, Sampled, decision
-from varpin.signals.inputs import as_moved, in_parts_of_steps
+from varpin.signals.inputs import as_moved, in_parts_of_steps, with_ends
 from varpin.simulation.failures import ConstraintError, ForceError
 from varpin.trajectory import Trajectory
 
@@ -112,7 +112,9 @@ def trajectory_of(
     N = len(steps.u)
     u, nodes = steps.u, np.zeros((N + 1, 0))
     if on is not None:
-        u, within, nodes = lines(on, steps.u, integrator.stage_times)
+        mean, stages, nodes = lines(on, steps.u, integrator.stage_times)
+        # A kinematic input's control is where its joint is at the end of the step.
+        u, within = with_ends(scene, mean, nodes[1:]), with_ends(scene, stages, nodes[1:])
     return Trajectory.assembled(
         t=np.arange(N + 1, dtype=np.float64) * dt,
         q=np.concatenate([first.q, steps.q]),

@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,12 +16,12 @@ from varpin.errors import InputError
 from varpin.finding import announce
 from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene, require_scene
-from varpin.signals.commands import open_loop
 from varpin.signals.controls import control_rows
 from varpin.signals.inputs import held_in_parts
 from varpin.simulation.check import distance, repeated
+from varpin.simulation.failures import StepFailure
 from varpin.simulation.ladder import ROUNDING, Trial, candidates
-from varpin.simulation.record import trajectory_of
+from varpin.simulation.simulate import simulate
 from varpin.simulation.start import on_constraints
 from varpin.support.checks import JointValues, joint_array, positive
 from varpin.support.frozen import Frozen
@@ -31,8 +31,6 @@ Result = TypeVar("Result")
 
 logger = logging.getLogger(__name__)
 
-# Steps of one joint between two chances for Ctrl-C: a tenth of a second.
-_CHUNK = 100_000
 # A first run this long [s] is as good as the next.
 _LONG = 0.2
 
@@ -108,21 +106,15 @@ class Setting(Frozen):
 
     def _timed(self, integrator: Integrator, steps: int) -> tuple[tuple[Trajectory, str], float]:
         """The motion once, why it failed, and its time [s]."""
-        scene, R, dt = self.scene, len(self.controls), self.duration / steps
+        scene, R, failure = self.scene, len(self.controls), ""
         rows = held_in_parts(scene, self.controls, self.q0, self.v0, self.duration / R, steps // R)
-        chunk, parts, failure = max(1, _CHUNK // len(self.q0)), [], ""
+        options: dict[str, Any] = {"dt": self.duration / steps, "steps": steps, "controls": rows, "check": False}
         begin = time.perf_counter()
-        state, (first,) = integrator.start(scene, self.q0[None], self.v0[None])
-        for done in range(0, steps, chunk):
-            commands = open_loop(rows[done : done + chunk])
-            (segment,) = integrator.rollout(scene, state, commands, np.zeros((0, 0, 0)), dt)
-            parts.append(segment)
-            if segment.failure is not None:
-                step = done + len(segment.q)
-                failure = f"step {step} of {steps} (t = {step * dt:.4g} s): {segment.failure.reason}"
-                break
-        seconds = time.perf_counter() - begin
-        return (trajectory_of(scene, integrator, dt, first, parts, None, None), failure), seconds
+        try:
+            motion = simulate(scene, self.q0, self.v0, integrator=integrator, **options)
+        except StepFailure as error:
+            motion, failure = error.trajectory, error.problem
+        return (motion, failure), time.perf_counter() - begin
 
     def trial(self, integrator: Integrator, steps: int, *, repeats: int = 0, within: float = math.inf) -> Trial:
         """A run and its error, from its repetition by a better method, as a trial of a ladder."""

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import partial
 from typing import ClassVar, Literal
 
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.ensemble.paths import without_geometry
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Gauss, Integrator, Reference
 from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
@@ -21,7 +18,6 @@ from varpin.simulation.ladder import ROUNDING, SENSIBLE, Ladder, Trial, first_st
 from varpin.study.motion import Setting, integrators_of
 from varpin.study.record import Chart, Progress, Study, collect, pareto_front
 from varpin.support.checks import JointValues, count, positive
-from varpin.support.executors import in_order, require_executor
 
 Quantity = Literal["q", "energy"]
 
@@ -157,7 +153,6 @@ def work_precision(
     reference: Reference | None = None,
     repeats: int = 3,
     progress: Progress | None = None,
-    executor: Executor | None = None,
 ) -> WorkPrecision:
     """Measure errors and wall times of integrators over steps, on one motion.
 
@@ -177,18 +172,14 @@ def work_precision(
             constraints have ``Gauss(4)``, in steps that are reduced until nothing changes.
         repeats: Number of repetitions of each run; the fastest counts. Short runs have one more, which is not timed.
         progress: Called with (runs done, runs in all).
-        executor: Any ``concurrent.futures.Executor`` that takes the runs, one at a time each; they follow each other
-            here if left out. Errors are the same; wall times are those of its workers, and to be trusted where each
-            has a core, and all have the same kind.
 
     Raises:
         InputError: Wrong arguments.
         VarpinError: The reference cannot integrate the motion.
         StudyInterrupted: Ctrl-C; holds the runs so far. It is a KeyboardInterrupt.
     """
-    setting = Setting.of(without_geometry(require_scene(scene)), q0, v0, controls, duration)
+    setting = Setting.of(require_scene(scene), q0, v0, controls, duration)
     members, repeats = integrators_of(scene, integrators), count("repeats", repeats, least=1)
-    executor = None if executor is None else require_executor(executor)
     if reference is not None:
         if not isinstance(reference, Reference):
             raise InputError(f"reference must be a varpin.Reference, got {reference!r}")
@@ -202,9 +193,7 @@ def work_precision(
     text = f"{_CONSTRAINED} in ever smaller steps" if reference is None else str(reference)
     error = float(np.abs(exact - other).max())
     base = WorkPrecision((), scene.robot.name, setting.duration, text, error, samples)
-    measure = partial(_measure, setting, exact, repeats)
-    runs = (measure(job) for job in jobs) if executor is None else in_order(executor, measure, jobs)
-    return collect(base, runs, len(jobs), progress)
+    return collect(base, (_measure(setting, exact, repeats, *job) for job in jobs), len(jobs), progress)
 
 
 def _by(setting: Setting, reference: Reference, samples: int) -> tuple[Floats, Floats]:
@@ -260,9 +249,8 @@ def _samples(grids: Sequence[int], rows: int) -> int:
     return rows * max(k for k in range(1, min(shared, most) + 1) if shared % k == 0)
 
 
-def _measure(setting: Setting, exact: Floats, repeats: int, job: tuple[Integrator, int]) -> WorkPrecisionRun:
+def _measure(setting: Setting, exact: Floats, repeats: int, member: Integrator, steps: int) -> WorkPrecisionRun:
     """A run against the exact motion (K + 1, n)."""
-    member, steps = job
     error = energy = seconds = math.nan
     spread, counts, failure = 0.0, (0, 0, 0, 0), ""
     # An error of one run, whatever it is, does not stop the others.

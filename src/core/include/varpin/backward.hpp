@@ -23,8 +23,8 @@
 
 #include "varpin/dense.hpp"
 #include "varpin/linear_step.hpp"
+#include "varpin/simd.hpp"
 #include "varpin/steps.hpp"
-#include "varpin/tiles.hpp"
 
 namespace varpin {
 
@@ -66,7 +66,7 @@ class BackwardPass {
     // to the first. Returns -1, or the decision without a minimum.
     std::ptrdiff_t run(double h, int hold, double regularization, const ExpandedSteps& steps, const Gains& gains) {
 #if defined(__x86_64__) && defined(__GNUC__)
-        if (has_wide()) return run_wide(h, hold, regularization, steps, gains);
+        if (has_avx2()) return run_avx2(h, hold, regularization, steps, gains);
 #endif
         return run_steps(h, hold, regularization, steps, gains);
     }
@@ -78,7 +78,7 @@ class BackwardPass {
 
   private:
 #if defined(__x86_64__) && defined(__GNUC__)
-    [[gnu::target("avx2"), gnu::flatten]] std::ptrdiff_t run_wide(double h, int hold, double regularization,
+    [[gnu::target("avx2"), gnu::flatten]] std::ptrdiff_t run_avx2(double h, int hold, double regularization,
                                                                   const ExpandedSteps& steps, const Gains& gains) {
         return run_steps(h, hold, regularization, steps, gains);
     }

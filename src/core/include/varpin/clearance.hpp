@@ -17,9 +17,9 @@
 #include <optional>
 #include <vector>
 
+#include "varpin/checks.hpp"
 #include "varpin/dense.hpp"
 #include "varpin/dynamics.hpp"
-#include "varpin/look.hpp"
 #include "varpin/policy.hpp"
 #include "varpin/tree.hpp"
 

@@ -69,8 +69,8 @@ class Collocation {
           stage(stages, Jet<double>(mechanism.tree, false)),
           V(stages * n),
           Q(stages * n),
-          slope(stages * n),
-          slope_rest(stages * n),
+          force_sum(stages * n),
+          force_rest(stages * n),
           acting(stages * n),
           residual(stages * n),
           delta(stages * n),
@@ -99,8 +99,8 @@ class Collocation {
     std::unique_ptr<StepElimination> elimination;  // at the iterate of the last factors; null where there are matrices
     std::vector<double> V;                         // (s, n) stage velocities: the guess, then the root
     std::vector<double> Q;                         // (s, n)
-    std::vector<double> slope;                     // (s, n) L_q + F
-    std::vector<double> slope_rest;                // (s, n) of correct_slopes; less than the last digit of `slope`
+    std::vector<double> force_sum;                 // (s, n) L_q + F
+    std::vector<double> force_rest;                // (s, n) of correct_forces; less than the last digit of `force_sum`
     std::vector<JointForce<double>> acting;        // (s, n) of elements and couplings; derivatives of elements only
     std::vector<double> coupled_q;                 // (s, n, n) dF/dq of couplings, if there are such forces
     std::vector<double> coupled_v;                 // (s, n, n) dF/dv
@@ -111,10 +111,10 @@ class Collocation {
     // The first factorization is kept until a second correction shows its contraction, and for as long as three more
     // corrections would suffice. The iteration fails when a correction exceeds half of the one before (natural
     // monotonicity, Deuflhard 2004), unless the residual is at its rounding floor. The residual after the last
-    // correction is not evaluated if its estimate is below a tenth of the tolerance; `slope_rest` then corrects `slope`
-    // to first order. The estimate follows from the contraction, or after a first correction from the nonlinearity of
-    // the equation. A guess within the tolerance is corrected too: extrapolated guesses have a similar error in every
-    // step, and energy would drift. With `jets_wanted`, the iteration ends with the jets at the root.
+    // correction is not evaluated if its estimate is below a tenth of the tolerance; `force_rest` then corrects
+    // `force_sum` to first order. The estimate follows from the contraction, or after a first correction from the
+    // nonlinearity of the equation. A guess within the tolerance is corrected too: extrapolated guesses have a similar
+    // error in every step, and energy would drift. With `jets_wanted`, the iteration ends with the jets at the root.
     //
     // Where drives come to their limits, the equation bends within a fraction of a correction. If the iteration fails
     // there, it begins again where shortened corrections have led.
@@ -262,7 +262,7 @@ class Collocation {
             ++effort.newton_iterations;
             const double contraction = contraction_of(before, size);
             if (!jets_wanted && certainly_last(h, fresh, contraction, tolerance, worst)) {
-                correct_slopes(h);
+                correct_forces(h);
                 break;
             }
             fresh = before < infinity && !(worst * contraction * contraction * contraction <= tolerance);
@@ -392,11 +392,11 @@ class Collocation {
             }
         }
         if (second) take_over();
-        if (mechanism.pushes()) look_at_elements(start);
+        if (mechanism.pushes()) find_forces(start);
         (second ? effort.jets : effort.sweeps) += stages;
     }
 
-    void look_at_elements(const Start& start) {
+    void find_forces(const Start& start) {
         for (int i = 0; i < stages; ++i) {
             double* const by_q = coupled() ? &coupled_q[i * n * n] : nullptr;
             double* const by_v = coupled() ? &coupled_v[i * n * n] : nullptr;
@@ -463,8 +463,8 @@ class Collocation {
         for (int i = 0; i < stages; ++i) {
             const double* force = start.force_at(i);
             for (int c = 0; c < n; ++c) {
-                slope[i * n + c] = stage[i].Lq[c] + (force[c] + acting[i * n + c].value);
-                slope_rest[i * n + c] = 0.0;
+                force_sum[i * n + c] = stage[i].Lq[c] + (force[c] + acting[i * n + c].value);
+                force_rest[i * n + c] = 0.0;
             }
         }
         for (int i = 0; i < stages; ++i) {
@@ -494,7 +494,7 @@ class Collocation {
         if (stages == 1) return assemble_one(n, h, block, matrix);
         const int width = block.end - block.begin, size = stages * width;
         std::fill(matrix, matrix + size * size, 0.0);
-        // Row r of the derivative of slope j in all of V, added to the rows of N in one long loop.
+        // Row r of the derivative of L_q + F at stage j in all of V, added to the rows of N in one long loop.
         for (int r = 0; r < width; ++r) {
             const int row = block.begin + r;
             for (int j = 0; j < stages; ++j) {
@@ -570,8 +570,8 @@ class Collocation {
     }
 
     // (A_i' + F_v,i) x_i + (L_qq,i + F_q,i) h sum_j a_ij x_j into `change`, for x in `delta`, the last solution.
-    void change_of_slope(double h, std::vector<double>& change) {
-        elimination->change_of_slope(delta.data(), change.data());
+    void change_of_force(double h, std::vector<double>& change) {
+        elimination->change_of_force(delta.data(), change.data());
         if (!mechanism.forces.any()) return;
         for (int i = 0; i < stages; ++i) {
             for (int c = 0; c < n; ++c) {
@@ -583,9 +583,10 @@ class Collocation {
         }
     }
 
-    // Correct L_q + F of the stages for the step `delta`, to first order, in `slope_rest`. Rounding would take the
-    // correction from a sum with `slope`; the errors of guesses have a similar sign in every step, and energy drifts.
-    void correct_slopes(double h) {
+    // Correct L_q + F of the stages for the step `delta`, to first order, in `force_rest`. Rounding would take the
+    // correction from a sum with `force_sum`; the errors of guesses have a similar sign in every step, and energy
+    // drifts.
+    void correct_forces(double h) {
         std::vector<double>& moved = residual;
         for (int i = 0; i < stages; ++i) {
             for (int c = 0; c < n; ++c) {
@@ -604,11 +605,11 @@ class Collocation {
             double total = 0.0;
             for (int c = 0; c < n; ++c) total += own_v[c] * delta[first + c] + own_q[c] * moved[first + c];
             acting[k].value += total;
-            slope_rest[k] += total;
+            force_rest[k] += total;
         }
         if (eliminated()) {
-            change_of_slope(h, moved);
-            for (int k = 0; k < stages * n; ++k) slope_rest[k] += moved[k];
+            change_of_force(h, moved);
+            for (int k = 0; k < stages * n; ++k) force_rest[k] += moved[k];
             return;
         }
         for (int i = 0; i < stages; ++i) {
@@ -618,7 +619,7 @@ class Collocation {
                     double total = element.by_v * delta[i * n + r] + element.by_q * moved[i * n + r];
                     for (int c = block.begin; c < block.end; ++c)
                         total += stage[i].Lqq[r * n + c] * moved[i * n + c] + stage[i].A[c * n + r] * delta[i * n + c];
-                    slope_rest[i * n + r] += total;
+                    force_rest[i * n + r] += total;
                 }
             }
         }

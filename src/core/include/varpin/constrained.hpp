@@ -49,7 +49,7 @@ class ConstrainedStepper : public VariationalStepper {
         if (inputs.cubic) from_q.resize(n), from_v.resize(n);
     }
 
-    bool look_at(PathState& state) override {
+    bool factor_at(PathState& state) override {
         for (int i = 0; i < n; ++i) at[i] = state.position[i].value.high;
         if (!find_basis(at.data(), state.rank, here)) return false;
         energy_guard.velocity(state.momentum.data(), state.v.data());
@@ -100,7 +100,7 @@ class ConstrainedStepper : public VariationalStepper {
 
     bool enter(PathState& state, bool project) override {
         state.rank = -1;
-        if (!look_at(state)) return false;
+        if (!factor_at(state)) return false;
         state.rank = here.rank();
         for (const DrivenRow& own : inputs.driven) state.rate[own.row] = state.v[own.coordinate];
         if (project) absorb(state);
@@ -187,7 +187,7 @@ class ConstrainedStepper : public VariationalStepper {
                 visit_points(h, start);
                 const double open = rows_error(h);
                 if (open <= tolerance) {
-                    equation.correct_slopes(h);
+                    equation.correct_forces(h);
                     push();
                     worst = std::max(left, open);
                     break;
@@ -266,7 +266,7 @@ class ConstrainedStepper : public VariationalStepper {
         state.rate = rate;
         exchange(origin, here);
         exchange(here, there);
-        return turned && !look_at(state) ? Outcome::singular : Outcome::solved;
+        return turned && !factor_at(state) ? Outcome::singular : Outcome::solved;
     }
 
   private:
@@ -384,8 +384,8 @@ class ConstrainedStepper : public VariationalStepper {
         for (int i = 0; i < stages; ++i) {
             for (int c = 0; c < n; ++c) {
                 const int k = i * n + c;
-                equation.slope[k] = equation.stage[i].Lq[c] + (start.force_at(i)[c] + equation.acting[k].value);
-                equation.slope_rest[k] = 0.0;
+                equation.force_sum[k] = equation.stage[i].Lq[c] + (start.force_at(i)[c] + equation.acting[k].value);
+                equation.force_rest[k] = 0.0;
             }
         }
         for (int i = 0; i < stages; ++i) {
@@ -393,7 +393,7 @@ class ConstrainedStepper : public VariationalStepper {
                 double sum = 0.0, scale = 0.0, across_rows = 0.0, across_size = 0.0;
                 for (int j = 0; j < stages; ++j) {
                     const double a = tableau.a[i * stages + j];
-                    sum += a * equation.slope[j * n + c];
+                    sum += a * equation.force_sum[j * n + c];
                     scale += std::abs(a) * (equation.stage[j].Lq_scale[c] + std::abs(start.force_at(j)[c]) +
                                             equation.acting[j * n + c].scale);
                     across_rows += weight[i * stages + j] * pushed[j * n + c];

@@ -89,13 +89,13 @@ class CostSample {
 
     // The value of each term at (q, v, u), with row `row` of the targets.
     void values(const double* q, const double* v, const double* u, std::size_t row, double* found) {
-        look(q, v, u, false);
+        evaluate(q, v, u, false);
         for (const CostTerm& term : costs_.terms) *found++ = weigh(term, row);
     }
 
     // Add the gradient of all terms (2n + m), and the Hessians (2n + m, 2n + m) of terms that are not linear.
     void expand(const double* q, const double* v, const double* u, std::size_t row, double* gradient, double* hessian) {
-        look(q, v, u, true);
+        evaluate(q, v, u, true);
         for (const CostTerm& term : costs_.terms) {
             weigh(term, row);
             if (term.subject == Subject::entries) {
@@ -161,7 +161,7 @@ class CostSample {
     Manipulability dexterity_;
     std::vector<double> error_, weighted_;
 
-    void look(const double* q, const double* v, const double* u, bool slopes) {
+    void evaluate(const double* q, const double* v, const double* u, bool slopes) {
         const int n = costs_.dof;
         std::copy_n(q, n, z_.begin());
         std::copy_n(v, n, z_.begin() + n);

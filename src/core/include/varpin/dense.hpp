@@ -8,7 +8,7 @@
 #include <limits>
 #include <utility>
 
-#include "varpin/pair.hpp"
+#include "varpin/simd.hpp"
 #include "varpin/tree.hpp"
 
 namespace varpin {

@@ -20,7 +20,7 @@
 #include "varpin/dense.hpp"
 #include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
-#include "varpin/pair.hpp"
+#include "varpin/simd.hpp"
 #include "varpin/slope_rows.hpp"
 #include "varpin/slopes.hpp"
 #include "varpin/spatial.hpp"

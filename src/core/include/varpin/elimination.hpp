@@ -37,9 +37,9 @@
 
 #include "varpin/dense.hpp"
 #include "varpin/elimination_rows.hpp"
-#include "varpin/gathering.hpp"
 #include "varpin/jet.hpp"
 #include "varpin/spatial.hpp"
+#include "varpin/subtree_sums.hpp"
 #include "varpin/symmetric_elimination.hpp"
 #include "varpin/tableau.hpp"
 #include "varpin/tree.hpp"
@@ -48,9 +48,10 @@ namespace varpin {
 
 // Model of computing times, in units of the time to eliminate a body in a step with one stage. A dense step takes
 // body_cost for each body, pair_cost for each pair of a body and itself or an ancestor, and block_cost times the cubed
-// size of each block. Elimination of a body takes stages_cost with more stages, tied_cost with one stage and ties, and
-// a share of slot_cost more for each slot of ties. Measured on chains with and without ties, on hands and on arms.
-inline constexpr double body_cost = 0.6, pair_cost = 0.033, block_cost = 0.0004, stages_cost = 1.3, tied_cost = 1.45,
+// size of each block. Elimination of a body takes stages_cost with more stages, mimic_cost with one stage and mimic
+// joints, and a share of slot_cost more for each slot of mimic joints. Measured on chains with and without mimic
+// joints, on hands and on arms.
+inline constexpr double body_cost = 0.6, pair_cost = 0.033, block_cost = 0.0004, stages_cost = 1.3, mimic_cost = 1.45,
                         slot_cost = 0.1;
 
 // Whether solves with M, or with the matrix of a step of so many stages, are faster without forming the matrix.
@@ -65,8 +66,8 @@ inline bool eliminates(const Tree& tree, int stages = 1) {
         const double size = block.end - block.begin;
         dense += block_cost * size * size * size;
     }
-    const int slots = Ties(tree).slots;
-    const double cost = stages > 1 ? stages_cost : slots > 0 ? tied_cost : 1.0;
+    const int slots = Mimics(tree).slots;
+    const double cost = stages > 1 ? stages_cost : slots > 0 ? mimic_cost : 1.0;
     return cost * (1.0 + slot_cost * slots) * tree.size() < dense;
 }
 
@@ -98,7 +99,7 @@ struct EliminatedBody {
 
     // The body's entry of (A' + ha L_qq) x. `rate_of_x` is ha x of its coordinate, `moved` and `above` are the motions
     // of the body and its parent, nine entries each, and z is the sum of its children, to which the body is added.
-    double change_of_slope(double rate_of_x, const double* moved, const double* above, double* z) const {
+    double change_of_force(double rate_of_x, const double* moved, const double* above, double* z) const {
         double added[10];
         detail::write_padded(inertia * detail::motion_at(moved) + rate_of_x * turned, rate_of_x * lifted, added);
         for (int r = 0; r < 9; ++r) z[r] += added[r];
@@ -122,7 +123,7 @@ class StepElimination {
     // x with N x = b, both (s, n).
     virtual void solve(const double* b, double* x) = 0;
     // y_c = A_c' x_c + L_qq,c h sum_m a_cm x_m, (s, n), for the x of the last `solve`.
-    virtual void change_of_slope(const double* x, double* y) = 0;
+    virtual void change_of_force(const double* x, double* y) = 0;
     // sum_c b_c x_c' M_c x_c, armature included.
     virtual double kinetic_size(const double* x) = 0;
     // The smallest ratio of a pivot of M + c (A + A') - k L_qq + diag(d) to the same pivot of M, armature included, all
@@ -130,18 +131,19 @@ class StepElimination {
     virtual double least_pivot_ratio(double coupling, double k, const double* diagonal) = 0;
 };
 
-// The same for numbers that the compiler knows, one stage without ties, or does not.
+// The same for numbers that the compiler knows, one stage without mimic joints, or does not.
 template <class Stages, class Width, class Mass, class Curved>
 class SizedElimination final : public StepElimination {
   public:
-    SizedElimination(const Mechanism& mechanism, const Tableau& tableau, const std::shared_ptr<const Gathering>& order)
+    SizedElimination(const Mechanism& mechanism, const Tableau& tableau,
+                     const std::shared_ptr<const SubtreeOrder>& order)
         : mechanism_(&mechanism),
           tree_(&mechanism.tree),
           tableau_(&tableau),
           stages_(tableau.stages),
           order_(order),
           bodies_(9 * stages_),
-          width_(detail::even(bodies_ + stages_ * order->ties.slots)),
+          width_(detail::even(bodies_ + stages_ * order->mimics.slots)),
           state_(tree_->size() * stages_),
           factors_(tree_->size() * factor_size()),
           matrix_(order, width_ * width_),
@@ -162,7 +164,7 @@ class SizedElimination final : public StepElimination {
         diagonal_ = diagonal;
         sign_ = 1;
         for (int j = tree_->size() - 1; j >= 0 && sign_ != 0; --j) eliminate(j);
-        if (slots() > 0) eliminate_ties(-1, matrix_.of_ground());
+        if (slots() > 0) eliminate_mimics(-1, matrix_.of_ground());
         return sign_ > 0;
     }
 
@@ -179,18 +181,18 @@ class SizedElimination final : public StepElimination {
                 for (int i = 0; i < stages_; ++i) z[at(slot) + i] += along[i];
             }
             if (link.parent < 0 && slots() == 0) continue;
-            if (slots() > 0) substitute_ties(j, b, z, x);
+            if (slots() > 0) substitute_mimics(j, b, z, x);
             if (link.origin) detail::keep_linear(bodies_, 9, z);
             force_.hand_on(j, link.parent);
         }
-        if (slots() > 0) substitute_ties(-1, b, force_.of_ground(), x), move_ties(-1, x);
+        if (slots() > 0) substitute_mimics(-1, b, force_.of_ground(), x), move_mimics(-1, x);
         for (int j = 0; j < tree_->size(); ++j) {
             const Body& link = tree_->bodies[j];
             const double* above = motion(link.parent);
             double* moved = motion(j);
             if (slots() > 0) {
                 std::copy(above, above + width_, moved);
-                move_ties(j, x);
+                move_mimics(j, x);
                 above = moved;
             }
             if (slot_of(link.coordinate) < 0) find(link.coordinate, j, above, x);
@@ -200,7 +202,7 @@ class SizedElimination final : public StepElimination {
         }
     }
 
-    void change_of_slope(const double* x, double* y) override {
+    void change_of_force(const double* x, double* y) override {
         const int n = tree_->dof();
         std::fill(y, y + stages_ * n, 0.0);
         for (int j = tree_->size() - 1; j >= 0; --j) {
@@ -212,7 +214,7 @@ class SizedElimination final : public StepElimination {
                 double rate_of_x = 0.0;
                 for (int m = 0; m < stages_; ++m)
                     rate_of_x += h_ * tableau_->a[c * stages_ + m] * x[m * n + link.coordinate];
-                y[c * n + link.coordinate] += state.change_of_slope(rate_of_x, moved, above, z + 9 * c);
+                y[c * n + link.coordinate] += state.change_of_force(rate_of_x, moved, above, z + 9 * c);
             }
             if (link.parent < 0) continue;
             if (link.origin) detail::keep_linear(bodies_, 9, z);
@@ -266,7 +268,7 @@ class SizedElimination final : public StepElimination {
 
   private:
     // Factors of one body: (s, width), and the inverse of D (s, s), or D itself with one stage. l is multiplied by this
-    // inverse. u, l and D of a tied coordinate are stored with the first body that it moves.
+    // inverse. u, l and D of a mimic coordinate are stored with the first body that it moves.
     struct Factors {
         double *row, *column, *u, *l, *inverse;
     };
@@ -279,8 +281,8 @@ class SizedElimination final : public StepElimination {
     }
     double* motion(int j) { return motion_.data() + width_ * (j + 1); }
 
-    int slots() const { return std::is_same_v<Width, int> ? order_->ties.slots : 0; }
-    int slot_of(int coordinate) const { return std::is_same_v<Width, int> ? order_->ties.slot[coordinate] : -1; }
+    int slots() const { return std::is_same_v<Width, int> ? order_->mimics.slots : 0; }
+    int slot_of(int coordinate) const { return std::is_same_v<Width, int> ? order_->mimics.slot[coordinate] : -1; }
     int at(int slot) const { return bodies_ + slot * stages_; }
 
     void eliminate(int j) {
@@ -315,17 +317,17 @@ class SizedElimination final : public StepElimination {
             }
         }
         if constexpr (std::is_same_v<Width, int>) own.add(X, width_);
-        if (slots() > 0) eliminate_ties(j, X);
+        if (slots() > 0) eliminate_mimics(j, X);
         if (link.origin) detail::keep_linear_rows(bodies_, 9, width_, X);
         matrix_.hand_on(j, link.parent);
     }
 
     // Add the bodies of mimic joints that end at body j to X, and eliminate their coordinates, (E4).
-    void eliminate_ties(int j, double* X) {
-        for (const Ties::Tied& tied : order_->ties.ending(j)) {
+    void eliminate_mimics(int j, double* X) {
+        for (const Mimics::Mimic& mimic : order_->mimics.ending(j)) {
             if (sign_ == 0) return;
-            const Factors factors_here = factors(tied.body);
-            const int slot = at(tied.slot);
+            const Factors factors_here = factors(mimic.body);
+            const int slot = at(mimic.slot);
             for (int i = 0; i < stages_; ++i) {
                 const double* line = X + (slot + i) * width_;
                 std::copy(line + slot, line + slot + stages_, &lu_[i * stages_]);
@@ -335,7 +337,7 @@ class SizedElimination final : public StepElimination {
             for (int i = 0; i < stages_; ++i) {
                 for (double* x : {factors_here.u, factors_here.l}) std::fill_n(x + i * width_ + slot, stages_, 0.0);
             }
-            take_out(tied.coordinate, factors_here, detail::NoInertia{}, X);
+            take_out(mimic.coordinate, factors_here, detail::NoInertia{}, X);
             detail::clear_slot(slot, stages_, width_, X);
         }
     }
@@ -383,12 +385,12 @@ class SizedElimination final : public StepElimination {
             detail::write_sum(width_, z, t, own.u + m * width_, z);
         }
     }
-    void substitute_ties(int j, const double* b, double* z, double* x) {
-        for (const Ties::Tied& tied : order_->ties.ending(j)) {
-            double* kept = z + at(tied.slot);
+    void substitute_mimics(int j, const double* b, double* z, double* x) {
+        for (const Mimics::Mimic& mimic : order_->mimics.ending(j)) {
+            double* kept = z + at(mimic.slot);
             double along[most_stages];
             std::copy(kept, kept + stages_, along);
-            substitute(tied.coordinate, tied.body, b, along, z, x);
+            substitute(mimic.coordinate, mimic.body, b, along, z, x);
             std::fill(kept, kept + stages_, 0.0);
         }
     }
@@ -399,11 +401,11 @@ class SizedElimination final : public StepElimination {
             x[m * tree_->dof() + c] -= detail::product(width_, factors(body).l + m * width_, above);
     }
     // In the order opposite to elimination.
-    void move_ties(int j, double* x) {
-        const std::vector<Ties::Tied>& ending = order_->ties.ending(j);
-        for (auto tied = ending.rbegin(); tied != ending.rend(); ++tied) {
-            find(tied->coordinate, tied->body, motion(j), x);
-            for (int m = 0; m < stages_; ++m) motion(j)[at(tied->slot) + m] = x[m * tree_->dof() + tied->coordinate];
+    void move_mimics(int j, double* x) {
+        const std::vector<Mimics::Mimic>& ending = order_->mimics.ending(j);
+        for (auto mimic = ending.rbegin(); mimic != ending.rend(); ++mimic) {
+            find(mimic->coordinate, mimic->body, motion(j), x);
+            for (int m = 0; m < stages_; ++m) motion(j)[at(mimic->slot) + m] = x[m * tree_->dof() + mimic->coordinate];
         }
     }
 
@@ -443,12 +445,12 @@ class SizedElimination final : public StepElimination {
     const Tree* tree_;
     const Tableau* tableau_;
     Stages stages_;
-    std::shared_ptr<const Gathering> order_;
-    int bodies_;                         // nine entries for each stage
-    Width width_;                        // plus one for each stage and slot of ties, rounded up to an even number
+    std::shared_ptr<const SubtreeOrder> order_;
+    int bodies_;   // nine entries for each stage
+    Width width_;  // plus one for each stage and slot of mimic joints, rounded up to an even number
     std::vector<EliminatedBody> state_;  // (b, s)
     std::vector<double> factors_;
-    detail::Gathered matrix_, force_;
+    detail::SubtreeSums matrix_, force_;
     std::vector<double> motion_;  // (b + 1, width) for the x of `solve`, after a zero for the base
     std::vector<Motion<double>> twist_;
     std::vector<double> lu_;
@@ -461,8 +463,8 @@ class SizedElimination final : public StepElimination {
 };
 
 inline std::unique_ptr<StepElimination> elimination_of(const Mechanism& mechanism, const Tableau& tableau) {
-    const auto order = std::make_shared<const Gathering>(mechanism.tree);
-    if (tableau.stages == 1 && order->ties.slots == 0)
+    const auto order = std::make_shared<const SubtreeOrder>(mechanism.tree);
+    if (tableau.stages == 1 && order->mimics.slots == 0)
         return std::make_unique<SizedElimination<Known<1>, Known<10>, Known<6>, Known<12>>>(mechanism, tableau, order);
     return std::make_unique<SizedElimination<int, int, int, int>>(mechanism, tableau, order);
 }

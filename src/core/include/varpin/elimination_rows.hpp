@@ -5,7 +5,7 @@
 
 #include <algorithm>
 
-#include "varpin/pair.hpp"
+#include "varpin/simd.hpp"
 #include "varpin/size.hpp"
 #include "varpin/spatial.hpp"
 

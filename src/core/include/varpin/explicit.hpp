@@ -18,7 +18,6 @@
 #include "varpin/dynamics.hpp"
 #include "varpin/nodes.hpp"
 #include "varpin/policy.hpp"
-#include "varpin/watch.hpp"
 
 namespace varpin {
 
@@ -216,10 +215,9 @@ class ExplicitRollout {
     }
 
     // Take all steps, each of length h. Each of these may be null: increments (P, N, K), a drift (P, N, n) added to the
-    // controls' force, and impulses (P, N, 2, n) added to the noise's before and after each step. For a single path a
-    // watch may end the rollout.
+    // controls' force, and impulses (P, N, 2, n) added to the noise's before and after each step.
     void roll(double h, const Commands& commands, const double* increments, const double* drift, const double* impulses,
-              const Nodes& nodes, Watch* watch = nullptr) {
+              const Nodes& nodes) {
         for (std::int64_t i = 0; i < paths_; ++i) {
             load(i);
             nodes.done[i] = 0;
@@ -232,7 +230,6 @@ class ExplicitRollout {
                 outcome = step(h, commands, dw, drift ? drift + row * dof() : nullptr, kicks, regular, nodes, i, s);
                 if (outcome != Outcome::solved) break;
                 nodes.done[i] = s + 1;
-                if (watch && !watch->after(s, 0)) break;
             }
             nodes.ended[i] = static_cast<std::int64_t>(outcome);
             store(i);

@@ -7,8 +7,8 @@
 #include <vector>
 
 #include "varpin/dense.hpp"
+#include "varpin/simd.hpp"
 #include "varpin/steps.hpp"
-#include "varpin/tiles.hpp"
 
 namespace varpin {
 

@@ -2,7 +2,7 @@
 // earlier accelerations X_k enter, and their sums. docs/mathematics.md, "Explicit methods".
 #pragma once
 
-#include "varpin/wide.hpp"
+#include "varpin/simd.hpp"
 
 namespace varpin {
 
@@ -127,7 +127,7 @@ template <int most>
 #endif
 inline void solve_slope_rows(const SlopeRows& rows, double* x) {
 #if defined(__x86_64__) && defined(__GNUC__)
-    if (has_wide()) return detail::solve_wide(rows, x);
+    if (has_avx2()) return detail::solve_wide(rows, x);
 #endif
     detail::solve_all<3>(rows, x);
 }
@@ -138,7 +138,7 @@ inline void solve_slope_rows(const SlopeRows& rows, double* x) {
 #endif
 inline void add_slopes(const SlopeSum& of, int first, int columns, double* sum) {
 #if defined(__x86_64__) && defined(__GNUC__)
-    if (has_wide()) return detail::add_wide_fours(of, first, columns, sum);
+    if (has_avx2()) return detail::add_wide_fours(of, first, columns, sum);
 #endif
     detail::add_fours(of, first, columns, sum);
 }

@@ -2,7 +2,7 @@
 // "Explicit methods".
 #pragma once
 
-#include "varpin/pair.hpp"
+#include "varpin/simd.hpp"
 #include "varpin/spatial.hpp"
 
 namespace varpin {

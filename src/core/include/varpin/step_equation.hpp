@@ -102,7 +102,7 @@ class StepEquation : public Collocation {
                 if (stages > 1 || kind < 2) {
                     right_side(h, kind, k);
                     solve_factored(residual.data(), delta.data());
-                    change_of_slope(h, columns);
+                    change_of_force(h, columns);
                 }
                 double* out = kind == 2 ? Jf + k : Jx + kind * n + k;
                 const int stride = (kind == 2 ? 1 : 2) * n;

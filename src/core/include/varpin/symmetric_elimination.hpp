@@ -9,24 +9,24 @@
 #include <vector>
 
 #include "varpin/elimination_rows.hpp"
-#include "varpin/gathering.hpp"
 #include "varpin/jet.hpp"
+#include "varpin/subtree_sums.hpp"
 #include "varpin/tree.hpp"
 
 namespace varpin {
 
 // u = X row + u0, D = d + row . u, and X - u u' / D is passed to the parent. Rows have `size` entries, six for each
-// motion, and then one for each slot of ties. A body with a tied coordinate passes X, with u added to the row and
-// column of the slot, and row . u and twice the slot's entry of u added to its diagonal. A width is known where there
-// are no ties.
+// motion, and then one for each slot of mimic joints. A body with a mimic coordinate passes X, with u added to the row
+// and column of the slot, and row . u and twice the slot's entry of u added to its diagonal. A width is known where
+// there are no mimic joints.
 template <class Width>
 class SymmetricElimination {
   public:
-    SymmetricElimination(const Tree& tree, const std::shared_ptr<const Gathering>& order, int size)
+    SymmetricElimination(const Tree& tree, const std::shared_ptr<const SubtreeOrder>& order, int size)
         : tree_(&tree),
           order_(order),
           size_(size),
-          width_(detail::even(size + order->ties.slots)),
+          width_(detail::even(size + order->mimics.slots)),
           u_(width_),
           row_(width_ * tree.size()),
           answer_(width_ * tree.size()),
@@ -61,10 +61,10 @@ class SymmetricElimination {
             X[at * width_ + at] += along_axis;
         }
         if constexpr (std::is_same_v<Width, int>) own.add(X, width_);
-        if (!take_out_ties(j, diagonal, X)) return false;
+        if (!take_out_mimics(j, diagonal, X)) return false;
         if (link.origin) detail::keep_linear_rows(size_, 6, width_, X);
         matrix_.hand_on(j, link.parent);
-        return j > 0 || slots() == 0 || take_out_ties(-1, diagonal, matrix_.of_ground());
+        return j > 0 || slots() == 0 || take_out_mimics(-1, diagonal, matrix_.of_ground());
     }
 
     // D of a coordinate: for M, its inertia with its subtree free [kg m^2 or kg].
@@ -78,11 +78,11 @@ class SymmetricElimination {
             if (share) share[c] = 0.5 * left * x[c];
             detail::write_sum(width_, z, left, answer(body), z);
         };
-        const auto substitute_ties = [&](int j, double* z) {
-            for (const Ties::Tied& tied : order_->ties.ending(j)) {
-                double& tied_force = z[size_ + tied.slot];
-                substitute(tied.coordinate, tied.body, b[tied.coordinate] - tied_force, z);
-                tied_force = 0.0;
+        const auto substitute_mimics = [&](int j, double* z) {
+            for (const Mimics::Mimic& mimic : order_->mimics.ending(j)) {
+                double& mimic_force = z[size_ + mimic.slot];
+                substitute(mimic.coordinate, mimic.body, b[mimic.coordinate] - mimic_force, z);
+                mimic_force = 0.0;
             }
         };
         for (int j = tree_->size() - 1; j >= 0; --j) {
@@ -95,18 +95,18 @@ class SymmetricElimination {
             } else {
                 z[size_ + slot] += along;
             }
-            if (slots() > 0) substitute_ties(j, z);
+            if (slots() > 0) substitute_mimics(j, z);
             if (link.origin) detail::keep_linear(size_, 6, z);
             force_.hand_on(j, link.parent);
         }
-        if (slots() > 0) substitute_ties(-1, force_.of_ground()), move_ties(-1, motion_.data(), x);
+        if (slots() > 0) substitute_mimics(-1, force_.of_ground()), move_mimics(-1, motion_.data(), x);
         for (int j = 0; j < tree_->size(); ++j) {
             const Body& link = tree_->bodies[j];
             const double* above = motion_.data() + width_ * (link.parent + 1);
             double* moved = motion_.data() + width_ * (j + 1);
             if (slots() > 0) {
                 std::copy(above, above + width_, moved);
-                move_ties(j, moved, x);
+                move_mimics(j, moved, x);
                 above = moved;
             }
             const int c = link.coordinate;
@@ -117,8 +117,8 @@ class SymmetricElimination {
 
   private:
     double* answer(int j) { return answer_.data() + width_ * j; }
-    int slots() const { return std::is_same_v<Width, int> ? order_->ties.slots : 0; }
-    int slot_of(int coordinate) const { return std::is_same_v<Width, int> ? order_->ties.slot[coordinate] : -1; }
+    int slots() const { return std::is_same_v<Width, int> ? order_->mimics.slots : 0; }
+    int slot_of(int coordinate) const { return std::is_same_v<Width, int> ? order_->mimics.slot[coordinate] : -1; }
 
     // Eliminate coordinate c with its u and D; `solve` needs u / D, which is stored with body j.
     template <class Own>
@@ -131,36 +131,36 @@ class SymmetricElimination {
         return true;
     }
 
-    bool take_out_ties(int j, const double* diagonal, double* X) {
+    bool take_out_mimics(int j, const double* diagonal, double* X) {
         if (slots() == 0) return true;
-        for (const Ties::Tied& tied : order_->ties.ending(j)) {
-            const int at = size_ + tied.slot, c = tied.coordinate;
+        for (const Mimics::Mimic& mimic : order_->mimics.ending(j)) {
+            const int at = size_ + mimic.slot, c = mimic.coordinate;
             std::copy(X + at * width_, X + (at + 1) * width_, u_.begin());
             const double pivot = diagonal[c] + u_[at];
             u_[at] = 0.0;
-            if (!take_out(c, tied.body, pivot, detail::NoInertia{}, X)) return false;
+            if (!take_out(c, mimic.body, pivot, detail::NoInertia{}, X)) return false;
             detail::clear_slot(at, 1, width_, X);
         }
         return true;
     }
 
     // In the order opposite to elimination.
-    void move_ties(int j, double* moved, double* x) {
-        const std::vector<Ties::Tied>& ending = order_->ties.ending(j);
-        for (auto tied = ending.rbegin(); tied != ending.rend(); ++tied) {
-            x[tied->coordinate] -= detail::product(width_, answer(tied->body), moved);
-            moved[size_ + tied->slot] = x[tied->coordinate];
+    void move_mimics(int j, double* moved, double* x) {
+        const std::vector<Mimics::Mimic>& ending = order_->mimics.ending(j);
+        for (auto mimic = ending.rbegin(); mimic != ending.rend(); ++mimic) {
+            x[mimic->coordinate] -= detail::product(width_, answer(mimic->body), moved);
+            moved[size_ + mimic->slot] = x[mimic->coordinate];
         }
     }
 
     const Tree* tree_;
-    std::shared_ptr<const Gathering> order_;
+    std::shared_ptr<const SubtreeOrder> order_;
     int size_;
     Width width_;
     std::vector<double> u_;
     std::vector<double> row_, answer_;  // (b, width) row, and u / D
     std::vector<double> pivot_;         // (n)
-    detail::Gathered matrix_, force_;
+    detail::SubtreeSums matrix_, force_;
     std::vector<double> motion_;  // (b + 1, width) of each body, after a zero for the base
 };
 
@@ -168,9 +168,9 @@ class SymmetricElimination {
 class ArticulatedBodies {
   public:
     explicit ArticulatedBodies(const Tree& tree) : tree_(&tree), inertia_(tree.size()) {
-        const auto order = std::make_shared<const Gathering>(tree);
-        if (order->ties.slots > 0) {
-            tied_.emplace(tree, order, 6);
+        const auto order = std::make_shared<const SubtreeOrder>(tree);
+        if (order->mimics.slots > 0) {
+            mimic_.emplace(tree, order, 6);
         } else {
             free_.emplace(tree, order, 6);
         }
@@ -189,22 +189,22 @@ class ArticulatedBodies {
     // Set the axis and the inertia of body j alone.
     void set_body(int j, const Motion<double>& axis, const Inertia<double>& inertia) {
         inertia_[j] = inertia;
-        detail::write(axis, free_ ? free_->row(j) : tied_->row(j));
+        detail::write(axis, free_ ? free_->row(j) : mimic_->row(j));
     }
 
     // Eliminate body j, from the last body to the first; false at a pivot that is not positive.
-    bool eliminate(int j) { return free_ ? eliminate_in(*free_, j) : eliminate_in(*tied_, j); }
+    bool eliminate(int j) { return free_ ? eliminate_in(*free_, j) : eliminate_in(*mimic_, j); }
 
     // As SymmetricElimination's.
     void solve(const double* b, double* x, double* share) {
-        return free_ ? free_->solve(b, x, share) : tied_->solve(b, x, share);
+        return free_ ? free_->solve(b, x, share) : mimic_->solve(b, x, share);
     }
 
   private:
     const Tree* tree_;
     std::vector<Inertia<double>> inertia_;
     std::optional<SymmetricElimination<Known<6>>> free_;
-    std::optional<SymmetricElimination<int>> tied_;  // for coordinates that move several bodies
+    std::optional<SymmetricElimination<int>> mimic_;  // for coordinates that move several bodies
 
     // Here and in step_elimination.hpp, the attribute `flatten` inlines all calls in the loop over bodies, which saves
     // a tenth of a step.

@@ -13,7 +13,6 @@
 #include "varpin/policy.hpp"
 #include "varpin/step_equation.hpp"
 #include "varpin/substeps.hpp"
-#include "varpin/watch.hpp"
 
 namespace varpin {
 
@@ -160,7 +159,7 @@ class VariationalStepper {
     }
 
     // Factor M at a path's node, for kicks and guesses, and find its constraints.
-    virtual bool look_at(PathState& state) {
+    virtual bool factor_at(PathState& state) {
         for (int i = 0; i < n; ++i) at[i] = state.position[i].value.high;
         return energy_guard.node(at.data(), state.momentum.data(), state.v.data());
     }
@@ -240,9 +239,9 @@ class VariationalStepper {
     // path that fails stops; nodes.ended and nodes.done hold the reason and the number of steps. These may be null:
     // `increments` of the Wiener processes (P, N, K) with K = increments_of_step, `drift`, a force in addition to the
     // controls (P, N, n), and `impulses` in addition to the noise, before and after each step, or held over it as the
-    // noise (P, N, 2, n). A `watch` may stop a single path.
+    // noise (P, N, 2, n).
     void roll(double h, const Commands& commands, const double* increments, const double* drift, const double* impulses,
-              std::vector<PathState>& states, const Nodes& nodes, Watch* watch = nullptr) {
+              std::vector<PathState>& states, const Nodes& nodes) {
         const std::int64_t steps = nodes.steps;
         const int controls = mechanism.controls;
         const std::int64_t width = increments_of_step(mechanism, commands);
@@ -252,7 +251,7 @@ class VariationalStepper {
         for (std::int64_t path = 0; path < nodes.paths; ++path) {
             PathState& state = states[path];
             double* u = nodes.u + path * steps * controls;
-            const bool regular = look_at(state);
+            const bool regular = factor_at(state);
             state.halvings.clear();
             state.impulses.clear();
             state.impulses.reserve(steps * m);
@@ -285,7 +284,6 @@ class VariationalStepper {
                 if (pushes) kick(pushes + (2 * row + 1) * n, state);
                 record_node(state, n, nodes, row);
                 nodes.done[path] = s + 1;
-                if (watch && !watch->after(s, effort.substeps)) break;
             }
         }
         outer = nullptr;
@@ -329,7 +327,7 @@ class VariationalStepper {
     // Enter the first node of a path.
     virtual bool enter(PathState& state, bool project) {
         static_cast<void>(project);
-        return look_at(state);
+        return factor_at(state);
     }
     // Remove the part of a path's momentum that is normal to the constraints.
     virtual void absorb(PathState&) {}
@@ -422,8 +420,8 @@ class VariationalStepper {
                 const double share = h * tableau.b[i], velocity = equation.V[i * n + c];
                 const JointForce<double>& element = equation.acting[i * n + c];
                 move += tableau.b[i] * velocity;
-                momentum += tableau.b[i] * equation.slope[i * n + c];
-                rest += tableau.b[i] * equation.slope_rest[i * n + c];
+                momentum += tableau.b[i] * equation.force_sum[i * n + c];
+                rest += tableau.b[i] * equation.force_rest[i * n + c];
                 const double given_force = force[i * stride + c];
                 trial.work[c] += share * (given_force + element.value) * velocity;
                 trial.dissipated[c] += share * element.lost;

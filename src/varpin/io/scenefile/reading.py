@@ -154,13 +154,6 @@ class Where:
             raise self.error(f"must have {len(names)} numbers, for {', '.join(names) or 'nothing'}; got {len(given)}")
         return np.array([self.check(finite, value) for value in given], dtype=np.float64)
 
-    def weights(self, given: Any, names: Sequence[str], what: str = "joint") -> Floats:
-        """Numbers as :meth:`numbers` that are not negative."""
-        found = self.numbers(given, names, what)
-        if (found < 0.0).any():
-            raise self.error(f"must be >= 0, got {found.min():g}")
-        return found
-
     def positions(self, given: Any, robot: Robot) -> Floats:
         """Positions of the joints (n,) [rad or m]: a posture of the robot by its name, or as :meth:`numbers`."""
         if isinstance(given, str):

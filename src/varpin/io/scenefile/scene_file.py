@@ -186,11 +186,19 @@ class SceneFile:
 
         Raises:
             InputError: A wrong option.
+            SceneFileError: A wrong option of the file.
         """
         given = self._options | options
-        if controls is None and resume is None and (self._pays_apart() if apart is None else apart):
-            controls = self._planned_apart(given)
-        return solve(self.problem, controls, resume=resume, **given)
+        try:
+            if controls is None and resume is None and (self._pays_apart() if apart is None else apart):
+                controls = self._planned_apart(given)
+            return solve(self.problem, controls, resume=resume, **given)
+        except InputError as error:
+            where = self._task.where.at("solve")
+            wrong = where.of(error, {name: value for name, value in self._options.items() if name not in options})
+            if wrong.key == where.key:
+                raise
+            raise wrong from None
 
     def _pays_apart(self) -> bool:
         """Whether planning groups separately saves more linear algebra than setting up the parts costs."""

@@ -493,7 +493,7 @@ def _noise(where: Where, given: Any, robot: Robot, actuation: Floats, driven: Se
         of_control, at = word == "control", place.at("intensity")
         place.table(own, ("intensity", "center") if word == "state" else ("intensity",), ("intensity",))
         whose, what = (driven, "driven joint") if of_control else (robot.joint_names, "joint")
-        intensity: Floats = at.weights(own["intensity"], whose, what)
+        intensity: Floats = at.numbers(own["intensity"], whose, what)
         act = np.flatnonzero(intensity)
         if not len(act):
             continue
@@ -522,7 +522,7 @@ def _term(where: Where, table: Any, task: Task, horizon: tuple[float, float]) ->
     if "frame" in own and not robot.free_model.existFrame(own["frame"]):
         where.at("frame").one_of(own["frame"], [frame.name for frame in robot.free_model.frames])
     axes = names if names is not None else kinds.AXES.get(kind, ("weight",))
-    weight = where.at("weight").weights(own.pop("weight", 1.0), axes, what)
+    weight = where.at("weight").numbers(own.pop("weight", 1.0), axes, what)
     hold, terminal, given = own.pop("hold", None), own.pop("terminal", False), own.pop(target_key, None)
     if not isinstance(terminal, bool):
         raise where.at("terminal").error("must be true or false")

@@ -142,18 +142,18 @@ inline Inside inside_of(const Mechanism& mechanism, const Record& record, const 
                         const double* bounds) {
     const int n = mechanism.dof(), m = mechanism.controls;
     Inside found;
-    const auto look = [&](const double* values, int kind, bool& inside) {
+    const auto check = [&](const double* values, int kind, bool& inside) {
         const double *least = bounds + 2 * kind * n, *most = least + n;
         for (int c = 0; c < n; ++c) inside = inside && values[c] >= least[c] && values[c] <= most[c];
     };
     for (std::int64_t k = 0; k <= record.steps; ++k) {
-        look(record.q + k * n, 0, found.position);
-        look(record.v + k * n, 1, found.velocity);
+        check(record.q + k * n, 0, found.position);
+        check(record.v + k * n, 1, found.velocity);
     }
     std::vector<double> force(n);
     const auto push = [&](const double* u) {
         constant_force(mechanism, nullptr, u, force.data());
-        look(force.data(), 2, found.effort);
+        check(force.data(), 2, found.effort);
     };
     for (std::int64_t k = 0; k < record.steps; ++k) push(record.u + k * m);
     for (std::int64_t row = 0; within && row < record.steps * stages; ++row) push(within + row * m);

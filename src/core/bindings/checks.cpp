@@ -1,5 +1,5 @@
 // Checks of a finished motion.
-#include "varpin/look.hpp"
+#include "varpin/checks.hpp"
 
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
@@ -18,14 +18,14 @@ namespace {
 
 using namespace nanobind::literals;
 
-// Call `look` with the rows of q, v and f (K, n).
-template <class Look>
-auto at_rows(const Mechanism& mechanism, const In<2>& q, const In<2>& v, const In<2>& f, const Look& look) {
+// Call `check` with the rows of q, v and f (K, n).
+template <class Check>
+auto at_rows(const Mechanism& mechanism, const In<2>& q, const In<2>& v, const In<2>& f, const Check& check) {
     const auto n = static_cast<std::size_t>(mechanism.dof());
     for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}, {&f, "f"}}) require(*array, name, {q.shape(0), n});
     nb::gil_scoped_release release;
     Inertias inertias(mechanism);
-    return look(inertias, States{q.data(), v.data(), f.data(), q.shape(0)});
+    return check(inertias, States{q.data(), v.data(), f.data(), q.shape(0)});
 }
 
 double fastest_damping_at(const Mechanism& mechanism, In<2> q, In<2> v, In<2> f, double least) {
@@ -106,7 +106,7 @@ std::tuple<std::int64_t, std::int64_t, std::int64_t> alternation(In<2> v, std::o
 
 }  // namespace
 
-void register_look(nb::module_& m) {
+void register_checks(nb::module_& m) {
     m.def("longest_alternation", &alternation, "v"_a, "u"_a.none(), nb::kw_only(), "counts"_a, "idle"_a, "even"_a);
     m.def("fastest_damping", &fastest_damping_at, "mechanism"_a, "q"_a, "v"_a, "f"_a, "least"_a);
     m.def("pulls_fast", &pulls_fast_at, "mechanism"_a, "q"_a, "v"_a, "f"_a, "dt"_a);

@@ -11,17 +11,18 @@
 
 namespace varpin {
 
-// Ties: coordinates that move several bodies, because mimic joints follow them. Such a coordinate cannot be eliminated
-// with one of its bodies. From the first of its bodies on, the matrices that bodies pass to their parents have a row
-// and a column for it, its slot. It is eliminated at the body whose subtree has all of its bodies. Slots are reused.
-struct Ties {
-    struct Tied {
+// Mimic joints: coordinates that move several bodies, because mimic joints follow them. Such a coordinate cannot be
+// eliminated with one of its bodies. From the first of its bodies on, the matrices that bodies pass to their parents
+// have a row and a column for it, its slot. It is eliminated at the body whose subtree has all of its bodies. Slots are
+// reused.
+struct Mimics {
+    struct Mimic {
         int coordinate = 0;
         int slot = 0;
         int body = 0;  // the first body that it moves
     };
 
-    explicit Ties(const Tree& tree) : slot(tree.dof(), -1), ending_(tree.size() + 1) {
+    explicit Mimics(const Tree& tree) : slot(tree.dof(), -1), ending_(tree.size() + 1) {
         if (tree.size() == tree.dof()) return;
         std::vector<std::vector<int>> moved(tree.dof());
         for (int j = 0; j < tree.size(); ++j) moved[tree.bodies[j].coordinate].push_back(j);
@@ -61,11 +62,11 @@ struct Ties {
     int slots = 0;
     std::vector<int> slot;  // (n) -1 for a coordinate of one body
 
-    // The tied coordinates that are eliminated at body j, after its own; for j = -1, at the end.
-    const std::vector<Tied>& ending(int j) const { return ending_[j + 1]; }
+    // The mimic coordinates that are eliminated at body j, after its own; for j = -1, at the end.
+    const std::vector<Mimic>& ending(int j) const { return ending_[j + 1]; }
 
   private:
-    std::vector<std::vector<Tied>> ending_;  // (b + 1)
+    std::vector<std::vector<Mimic>> ending_;  // (b + 1)
 
     // The last body whose subtree has both; -1 if there is none.
     static int common(const Tree& tree, int i, int j) {
@@ -78,10 +79,11 @@ struct Ties {
 };
 
 // The storage cells in which bodies sum the contributions of their subtrees, from the last body to the first. Cells
-// are reused: a chain needs one, which stays in the cache. The fixed base has a cell after those of bodies, for ties.
-struct Gathering {
-    explicit Gathering(const Tree& tree)
-        : ties(tree), cell(tree.size() + 1, -1), joins(tree.size(), 0), leaf(tree.size() + 1, 1) {
+// are reused: a chain needs one, which stays in the cache. The fixed base has a cell after those of bodies, for mimic
+// joints.
+struct SubtreeOrder {
+    explicit SubtreeOrder(const Tree& tree)
+        : mimics(tree), cell(tree.size() + 1, -1), joins(tree.size(), 0), leaf(tree.size() + 1, 1) {
         std::vector<int> free;
         for (int j = tree.size() - 1; j >= 0; --j) {
             if (cell[j] < 0) {
@@ -90,7 +92,7 @@ struct Gathering {
                 free.pop_back();
             }
             int k = tree.bodies[j].parent;
-            if (k < 0 && ties.slots > 0) k = tree.size();
+            if (k < 0 && mimics.slots > 0) k = tree.size();
             if (k >= 0 && cell[k] < 0) {
                 cell[k] = cell[j];
                 leaf[k] = 0;
@@ -101,7 +103,7 @@ struct Gathering {
         }
     }
 
-    Ties ties;
+    Mimics mimics;
     int cells = 0;
     std::vector<int> cell;    // of each body; a first child has the cell of its parent
     std::vector<char> joins;  // has a cell of its own, which is added to that of its parent
@@ -111,9 +113,9 @@ struct Gathering {
 namespace detail {
 
 // The contributions of subtrees during elimination, `entries` numbers in each cell.
-class Gathered {
+class SubtreeSums {
   public:
-    Gathered(std::shared_ptr<const Gathering> order, int entries)
+    SubtreeSums(std::shared_ptr<const SubtreeOrder> order, int entries)
         : order_(std::move(order)), entries_(entries), at_(order_->cells * entries) {}
 
     // The sum of the children of body j.
@@ -123,7 +125,7 @@ class Gathered {
         return entries;
     }
     double* of_again(int j) { return at_.data() + order_->cell[j] * entries_; }
-    // The sum of the roots, for ties.
+    // The sum of the roots, for mimic joints.
     double* of_ground() { return at_.data() + order_->cell.back() * entries_; }
     // Pass the contribution of body j to its parent.
     void hand_on(int j, int parent) {
@@ -134,7 +136,7 @@ class Gathered {
     }
 
   private:
-    std::shared_ptr<const Gathering> order_;
+    std::shared_ptr<const SubtreeOrder> order_;
     int entries_;
     std::vector<double> at_;
 };

@@ -9,7 +9,7 @@
 namespace varpin {
 
 // Sums over quadratic models g . dz + (1/2) dz' H dz at some points.
-struct Stake {
+struct DecreaseBound {
     double free = 0.0;   // decrease if each variable were free; infinite where a model has no minimum
     double moved = 0.0;  // the same, with each model's decrease bounded by its change over a displacement
 
