@@ -40,7 +40,7 @@ from scipy.integrate import solve_ivp
 
 import varpin as vp
 from varpin.control.problem import bind_cost
-from varpin.control.verification import accurate_cost
+from varpin.control.verification import played
 from varpin.simulation.spectrum import rate_at_rest
 
 WITHIN = 0.01
@@ -132,7 +132,7 @@ def true_cost(problem: vp.OptimalControlProblem, policy: vp.LinearPolicy | None,
     substeps, lost = 2 * int(np.ceil(0.5 * at.dt * max(rate, COARSE))), 0
     for _ in range(DOUBLINGS):
         commands = policy.commands(N * substeps, m, n, False, dt=at.dt / substeps, stage_times=places)
-        found, _ = accurate_cost(at, commands, substeps)
+        found = played(at, at.in_parts(substeps), commands, at.integrator).cost
         if abs(found - before) <= (ACCURACY if found < 2.0 * planned else 0.5) * abs(found):
             return found
         lost += not np.isfinite(found)

@@ -108,7 +108,7 @@ def test_copies_and_files_know_the_option(tmp_path):
     for copy in (problem.at(dt=DT / 2), problem.at(q0=[0.1, 0.0]), problem.at(controls="linear")):
         assert copy.between_nodes
     assert not alone.at(dt=DT / 2).between_nodes
-    assert "between_nodes" in problem.differs(alone)
+    assert "between_nodes" in problem.differs(alone.setting)
     plan = vp.solve(alone, check=False)
     with pytest.raises(vp.InputError, match="between_nodes"):
         vp.solve(problem, resume=plan, check=False)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import varpin as vp
 from varpin import replay
-from varpin.control.hints import hints
+from varpin.control.checks import foreseen
 from varpin.model.clearance import clearance
 from varpin.model.kinematics import frame_kinematics
 from varpin.show.replay.surroundings import regions
@@ -186,7 +186,7 @@ def test_what_is_no_hull_is_refused(given, facts):
 @pytest.mark.parametrize("scale", [1.0, 1000.0])
 def test_millimetres(scale):
     problem = around(vp.Obstacle.convex(scale * WEDGE, [2.0, 1.0, 1.0], name="wedge"), steps=2)
-    told = naming(hints(problem), "millimetres", "'wedge'")
+    told = naming(foreseen(problem), "millimetres", "'wedge'")
     assert bool(told) == (scale > 1.0)
 
 

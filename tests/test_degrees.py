@@ -11,7 +11,7 @@ from refusals import refused, unnamed
 
 import varpin as vp
 from varpin.cli import main
-from varpin.control.hints import hints
+from varpin.control.checks import foreseen
 from varpin.model import degrees_hint
 
 HOME = np.array([0.0, -90.0, 90.0, 0.0, 45.0, 0.0])
@@ -58,8 +58,7 @@ def test_a_plan_names_units_before_everything_else(scene):
         scene, vp.ControlCost(1e-3), np.zeros(6), np.full(6, 4.0), dt=0.05, steps=4, constraints=[inside, reach]
     )
     plan = vp.solve(problem, max_iterations=1)
-    assert "millimetres" in plan.warnings[0]
-    assert any("start" in told for told in plan.warnings)
+    assert [told.kind for told in foreseen(plan.problem)] == ["goal in millimetres"]
     for goal, told in ((HOME, True), (np.deg2rad(HOME), False)):
         cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost(goal, 1.0))
         problem = vp.OptimalControlProblem(scene, cost, np.zeros(6), np.zeros(6), dt=0.05, steps=4)
@@ -107,7 +106,7 @@ def test_clearances_in_millimetres(distance, told):
     problem = vp.OptimalControlProblem(
         vp.Scene(robot), vp.ControlCost(1e-3), np.zeros(6), np.zeros(6), dt=0.05, steps=4, constraints=[clear]
     )
-    found = [finding for finding in hints(problem) if finding.kind == "places in millimetres"]
+    found = [finding for finding in foreseen(problem) if finding.kind == "places in millimetres"]
     assert len(found) == told
     assert not told or not unnamed(found[0], ("KeepClear: distance", f"{distance:g} m", "may be in millimetres"))
 
@@ -197,6 +196,6 @@ def test_millimetres_in_obstacles_and_regions(scene, make, named, scale):
     constraints = [make(scene.robot, scale)]
     given = {"dt": 0.05, "steps": 2, "constraints": constraints}
     problem = vp.OptimalControlProblem(scene, vp.ControlCost(1e-3), np.deg2rad(HOME), np.zeros(6), **given)
-    told = [found for found in hints(problem) if "millimetres" in found]
+    told = [found for found in foreseen(problem) if "millimetres" in found]
     assert bool(told) == (scale > 1.0)
     assert scale == 1.0 or not unnamed(told[0], named)

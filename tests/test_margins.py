@@ -1,15 +1,11 @@
 """Margins by count: chance constraints where values in motions under noise are not normally distributed."""
 
-import re
-
 import numpy as np
 import pytest
 from findings import about
 from scipy.special import ndtr
 
 import varpin as vp
-from varpin.control.noise import deviations
-from varpin.control.stages import Feedback, Steps
 
 ROBOT = vp.planar_chain(2)
 HANGING = np.array([np.pi / 2 - 0.3, 0.0])
@@ -53,50 +49,50 @@ def beyond_a_joint_limit(robot, begin, travel, noise, damping):
     return vp.OptimalControlProblem(scene, cost, begin, rest, constraints=[within], **GRID)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "begin", "travel"),
+    ("name", "begin", "travel", "noise"),
     [
-        ("ur3", [0.0, -1.0, 1.0, 0.0, 0.5, 0.0], 0.6),
-        ("z1", [0.0, 1.5, -1.5, 0.0, 0.0, 0.0, 0.0], 0.4),
-        ("panda", [0.0, -0.5, 0.0, -1.8, 0.0, 1.5, 0.5], 0.4),
+        ("ur3", [0.0, -1.0, 1.0, 0.0, 0.5, 0.0], 0.6, vp.ControlNoise(0.03)),
+        ("ur3", [0.0, -1.0, 1.0, 0.0, 0.5, 0.0], 0.6, vp.AdditiveNoise(0.1)),
+        ("z1", [0.0, 1.5, -1.5, 0.0, 0.0, 0.0, 0.0], 0.4, vp.AdditiveNoise(0.1)),
     ],
+    ids=["ur3, controls", "ur3", "z1"],
 )
-def test_chance_constraints_of_arms_hold(name, begin, travel):
+def test_chance_constraints_of_arms_hold(name, begin, travel, noise):
     """By noise of their controls, with the linear model's margins, 3 to 5 % of motions were outside."""
-    robot = vp.load_robot(name, lock={"panda_finger_joint1": 0.02} if name == "panda" else None)
-    problem = beyond_a_joint_limit(robot, begin, travel, vp.ControlNoise(0.05), 0.5)
+    problem = beyond_a_joint_limit(vp.load_robot(name), begin, travel, noise, 0.5)
     plan = vp.solve(problem, check=False)
     assert plan.status is vp.Status.CONVERGED, plan.reason
+    assert plan.search.counts > 0
     assert (values(problem, plan) > 0.0).mean(axis=0).max() <= allowed()
 
 
-@pytest.mark.slow
+def test_a_plan_with_margins_that_is_cut_is_resumed_as_if_it_had_not_been():
+    problem = under_a_lid(vp.AdditiveNoise(0.4))
+    whole = vp.solve(problem, check=False)
+    part = vp.solve(problem, check=False, max_iterations=8)
+    rest = vp.solve(problem, check=False, resume=part)
+    assert whole.status is rest.status is vp.Status.CONVERGED
+    np.testing.assert_array_equal(rest.controls, whole.controls)
+
+
 def test_noise_that_leaves_no_room_is_told_of():
-    """With the linear model's margins, four motions in ten were above the lid."""
-    plan = vp.solve(under_a_lid(vp.AdditiveNoise(1.5)))
-    assert plan.status is vp.Status.INFEASIBLE
-    assert "included, which is as wide as motions under noise need" in plan.reason
-    assert plan.multipliers.counts > 0
+    """It is above the lid in almost every second motion, whatever the margin."""
+    plan = vp.solve(under_a_lid(vp.AdditiveNoise(1.5)), max_iterations=60)
+    assert not plan.status.converged
+    assert about(plan.warnings, "small margin")
 
 
-@pytest.mark.slow
 def test_a_warning_of_a_small_margin_counts():
-    """What it says of a bound is so by ten times as many other motions, and the margin that it names suffices there."""
+    """Noise that Python evaluates leaves margins as they are; what is said of a bound is so by other motions."""
     coarse = {"dt": 0.1, "steps": 8}
-    problem = under_a_lid(vp.CustomNoise(lambda q, v, u: 1.5 * np.eye(2), 2), **coarse)
+    problem = under_a_lid(vp.CustomNoise(lambda q, v, u: 0.7 * np.eye(2), 2), **coarse)
     plan = vp.solve(problem)
-    (sentence,) = about(plan.warnings, "small margin")
-    time, share, error, margin = map(
-        float, re.search(r"t = (\S+) s .* by (\S+) \+- (\S+) % .*; margin=(\S+) is", sentence).groups()
-    )
+    (told,) = about(plan.warnings, "small margin")
     (bound,) = problem.bound_constraints
-    place = int(np.argmin(np.abs(bound.times - time)))
+    place = int(np.argmin(np.abs(bound.times - told.time)))
     # The same noise, compiled.
-    c = values(under_a_lid(vp.AdditiveNoise(1.5), **coarse), plan)[:, place, 0]
-    often = 100.0 * (c > 0.0).mean()
-    assert abs(often - share) < 3.5 * error
-    planned = bound.value(plan.trajectory.q, plan.trajectory.v, plan.controls)[place, 0]
-    own = deviations(Steps(problem, plan.trajectory), Feedback(plan.gains, plan.previous_gains), [bound])[0][place, 0]
-    # Farther away by as much as the margin is larger, as if motions about the plan stayed the same.
-    assert (c - planned > margin * own).mean() < 0.03
+    often = (values(under_a_lid(vp.AdditiveNoise(0.7), **coarse), plan)[:, place, 0] > 0.0).mean()
+    # Of 512 motions, at the worst of a few places.
+    assert abs(often - told.value) < 4.0 * np.sqrt(told.value / 512)
+    assert f"{100.0 * told.value:.3g} % of motions" in told

@@ -13,8 +13,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import varpin as vp
 from varpin.control import ViolationOnRobot
-from varpin.control.hints import hints
-from varpin.control.hints import reach as hints_reach
+from varpin.control.checks import foreseen, reach
 from varpin.model.clearance import capsule_around, clearance
 from varpin.model.kinematics import frame_kinematics
 from varpin.support.one_thread import one_thread
@@ -147,15 +146,10 @@ def test_a_file_of_other_constraints_is_refused_in_few_words(tmp_path):
 
     limits = vp.WithinVelocityLimits(robot, (-1.0, 1.0))
     path = vp.solve(problem(0.02, limits), check=False).save(tmp_path / "plan.npz")
-    with pytest.raises(vp.FileError) as error:
-        vp.Solution.load(path, problem(0.02))
-    assert str(error.value).endswith("constraints = KeepClear, WithinVelocityLimits, not KeepClear")
-    with pytest.raises(vp.FileError) as error:
-        vp.Solution.load(path, problem(0.03, limits))
-    assert "distance=0.02" in str(error.value)
-    assert "not ..." in str(error.value)
-    assert "distance=0.03" in str(error.value)
-    assert len(str(error.value)) < 600
+    for other in (problem(0.02), problem(0.03, limits)):
+        with refused(vp.FileError, "different constraints") as error:
+            vp.Solution.load(path, other)
+        assert len(str(error.value)) < 240
 
 
 def test_centres_that_move_are_compared_by_where_they_are():
@@ -485,24 +479,12 @@ def test_a_margin_without_noise_is_told_of():
     assert naming(plan.warnings, "margin", "noise")
 
 
-def told_of(problem):
-    return list(hints(problem))
-
-
-def test_hints_before_a_search():
-    """What no motion meets, or looks like other units, is named; what can be met is not."""
-    reach = {
+def test_what_is_told_before_a_search():
+    """What no motion meets, or looks like other units, is named, and these alone; what can be met is not."""
+    given = {
         ("2.1 m", "2 m"): [vp.ReachFrame(ROBOT, "tip", position=[2.1, 0.0, 0.0])],
         ("millimetres",): [vp.ReachFrame(ROBOT, "tip", position=[1200.0, 0.0, -900.0])],
-        ("two goals", "0.1 m"): [
-            vp.ReachFrame(ROBOT, "tip", position=[1.2, 0.0, -0.9]),
-            vp.ReachFrame(ROBOT, "tip", position=[1.2, 0.0, -1.0]),
-        ],
-        ("sphere", "0.2 m", "t = 1.2 s"): [
-            vp.ReachFrame(ROBOT, "tip", position=[1.2, 0.0, -0.9]),
-            vp.KeepOutOfSphere(ROBOT, "tip", lambda t: [1.2, 0.0, -2.2 + t], 0.3),
-        ],
-        ("90 rad",): [vp.WithinJointLimits(ROBOT, (-90.0, 90.0))],
+        ("90 rad",): [vp.WithinJointLimits(ROBOT, (10.0, 90.0)), vp.ReachFrame(ROBOT, "tip", position=[3.0, 0.0, 0.0])],
         ("joint1", "0.2 rad", "WithinJointLimits"): [vp.WithinJointLimits(ROBOT, (-1.0, 0.8))],
         ("joint1", "table", "0.01"): [
             vp.KeepClear(
@@ -512,15 +494,14 @@ def test_hints_before_a_search():
             )
         ],
     }
-    for facts, constraints in reach.items():
-        (told,) = told_of(two_links(constraints))
+    for facts, constraints in given.items():
+        (told,) = foreseen(two_links(constraints))
         assert not unnamed(told, facts)
     for constraints in FAMILIES.values():
-        assert all(not unnamed(told, "WithinJointLimits") for told in told_of(two_links(constraints)))
+        assert all(not unnamed(told, "WithinJointLimits") for told in foreseen(two_links(constraints)))
     degrees = vp.ControlCost(1e-2) + vp.Terminal(2.0 * vp.TrackingCost([60.0, 30.0], 1.0))
-    assert "60 rad" in told_of(two_links(FAMILIES["velocities"], cost=degrees))[0]
-    plan = vp.solve(two_links(reach["two goals", "0.1 m"], steps=8), max_iterations=0)
-    assert about(plan.warnings, "two goals")
+    (told,) = foreseen(two_links(FAMILIES["velocities"], cost=degrees, control_limits=(-1.0, 1.0)))
+    assert "60 rad" in told
 
 
 def one_joint(joint, lower, upper):
@@ -533,22 +514,6 @@ def one_joint(joint, lower, upper):
     return vp.load_robot(model)
 
 
-@pytest.mark.parametrize(("limits", "place", "always"), [
-    ((10.0, 12.0), 30.0, False), ((-30.0, -20.0), -7.0, False), ((0.0, 40.0), 3.0, False),
-    ((-np.inf, np.inf), 0.0, False), ((10.0, np.inf), 0.0, False), ((10.0, 12.0), 11.0, True),
-])  # fmt: skip
-def test_pairs_are_looked_at_over_the_whole_way_of_a_rail(limits, place, always):
-    """Limits that are all beyond a turn's 6.28, and an obstacle that has room beside it only there."""
-    robot = one_joint(pin.JointModelPX(), *limits)
-    wide = vp.Obstacle.sphere([place, 0.0, 0.0], 6.5)
-    clear = vp.KeepClear(robot, [wide], 0.02, capsules={"cart": ([0, 0, 0], [0, 0, 0.1], 0.05)})
-    begin = np.clip(0.5, *limits)
-    problem = vp.OptimalControlProblem(
-        vp.Scene(robot, gravity=False), vp.ControlCost(1.0), [begin], [0.0], dt=0.02, steps=10, constraints=[clear]
-    )
-    assert [told.kind for told in hints(problem)] == ["pair always too close"] * always
-
-
 def test_wide_limits_of_the_description_are_in_radians():
     robot = one_joint(pin.JointModelRZ(), -1e5, 1e5)
     for given, told in ((None, 0), ((-180.0, 180.0), 1)):
@@ -556,7 +521,7 @@ def test_wide_limits_of_the_description_are_in_radians():
         problem = vp.OptimalControlProblem(
             vp.Scene(robot, gravity=False), vp.ControlCost(1.0), [0], [0], dt=0.02, steps=10, constraints=constraints
         )
-        assert [found.kind for found in hints(problem)] == ["limits in degrees"] * told
+        assert [found.kind for found in foreseen(problem)] == ["limits in degrees"] * told
 
 
 ARMS = ("ur3", "ur5", "ur10", "panda", "z1", "xarm7", "kinova", "so100", "talos_arm", "finger")
@@ -574,14 +539,14 @@ def test_reach_bounds_where_a_frame_gets(name):
     places = kinematics.placements(q)[1]
     root = kinematics.links.translation[0]
     away = np.linalg.norm(places - root, axis=1)
-    most = hints_reach(robot, kinematics)
+    most = reach(robot, kinematics)
     assert away.max() <= most < 1.4 * away.max()
     farthest = places[away.argmax()]
     scene = vp.Scene(robot)
     for target, reached in ((farthest, True), (places[0], True), (root + 1.01 * most * np.eye(3)[2], False)):
         cost = vp.ControlCost(1e-3) + vp.Terminal(2.0 * vp.FramePositionCost(robot, frame, target, 10.0))
         problem = vp.OptimalControlProblem(scene, cost, q[0], np.zeros(robot.dof), dt=0.1, steps=2)
-        told = [finding for finding in hints(problem) if finding.kind == "goal out of reach"]
+        told = [finding for finding in foreseen(problem) if finding.kind == "goal out of reach"]
         assert len(told) == (not reached)
         assert reached or not unnamed(told[0], (frame, f"{1.01 * most:.4g} m", f"{most:.4g} m"))
 

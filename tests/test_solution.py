@@ -60,8 +60,8 @@ def test_true_cost(name, integrator, hold):
     """Open loop and with feedback, the end gaps and the defect: as by scipy on Pinocchio's forward dynamics."""
     problem, running, end = tracking(name, integrator, hold=hold)
     sol = vp.solve(problem)
-    found = sol.verify()
-    assert found.accuracy <= 1e-10
+    found = sol.verify(tolerance=1e-12)
+    assert found.accuracy <= 1e-12
     assert found.planned_cost == sol.cost
     scene, dt, motion = problem.scene, problem.dt, sol.trajectory
     q, v, integral = continuous(scene, problem.q0, problem.v0, sol.controls, dt * hold, running)

@@ -34,7 +34,7 @@ def same(a, b):
 @pytest.mark.parametrize(
     ("other", "facts"),
     [
-        ({"dt": 0.03}, ("steps", "30", "20")),
+        ({"dt": 0.03}, ("dt", "0.02", "0.03")),
         ({"q0": (0.4, -0.2)}, "q0"),
         ({"weight": 0.2}, "cost"),
         ({"damping": 0.3}, "damping"),
@@ -67,7 +67,7 @@ def test_forces_belong_to_the_problem(force, tmp_path):
     for file, wrong in ((path, problem_of()), (other, problem)):
         with refused(vp.FileError, "scene"):
             vp.Solution.load(file, wrong)
-    with refused(vp.InputError, "armature" if isinstance(force, vp.Armature) else "forces"):
+    with refused(vp.InputError, "armature" if isinstance(force, vp.Armature) else "scene"):
         vp.solve(problem_of(), resume=plan)
 
 

@@ -79,13 +79,13 @@ class Iteration:
     seconds: float
     second_order: bool = False
 
-    HEADER = "iter         cost   noise cost  expected  decrease      grad      reg      step  rollouts"
+    HEADER = "iter         cost noise cost expected decrease     grad     reg     step trials"
 
     def __str__(self) -> str:
         return (
-            f"{self.index:4d} {self.cost:12.6e} {self.noise_cost:12.4e} {self.expected_decrease:9.2e} "
-            f"{self.decrease:9.2e} {self.gradient:9.2e} {self.regularization:8.1e} {self.step:9.2e} {self.rollouts:9d}"
-            f"{'  second derivatives' if self.second_order else ''}"
+            f"{self.index:4d} {self.cost:12.6e} {self.noise_cost:10.3e} {self.expected_decrease:8.1e} "
+            f"{self.decrease:8.1e} {self.gradient:8.1e} {self.regularization:7.0e} {self.step:8.1e} "
+            f"{self.rollouts:6d}{' *' if self.second_order else ''}"
         )
 
 

@@ -3,32 +3,27 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from varpin.arrays import Floats, Integers
-from varpin.control.constraints import BoundConstraint
-from varpin.control.paths import Chunk, chunks_of, sent, shared_by
+from varpin.control.paths import Found, Paths, joined, path_of, simulated, with_margins
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.verification import excess, percent
 from varpin.ensemble.looks import greater, looked_at, looked_at_here
-from varpin.ensemble.paths import Extremes, simulate_paths
+from varpin.ensemble.paths import Extremes
 from varpin.errors import VarpinError
 from varpin.finding import Finding, announce
-from varpin.mechanics.wiener import Children, children
+from varpin.mechanics.wiener import children
 from varpin.signals.policy import LinearPolicy
 from varpin.simulation.check import check
-from varpin.simulation.failures import NoiseError, StepFailure
 from varpin.simulation.loop import unstable_loop
 from varpin.support.checks import count, told_motion
 from varpin.support.executors import executing, in_order, take_all
-from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, warning_count
 
 logger = logging.getLogger(__name__)
@@ -141,31 +136,6 @@ class MonteCarloInterrupted(KeyboardInterrupt):
         super().__init__(f"interrupted after {done} paths" + ("; they are in .result" if done else ""))
 
 
-@dataclass(frozen=True, eq=False)
-class _Costs(Frozen):
-    """Results of a chunk.
-
-    Attributes:
-        values: The costs of its paths (C,), NaN where one failed.
-        extremes: The extreme paths to check.
-        broken: Number of paths that violate each constraint with a margin, by its places and rows.
-    """
-
-    values: Floats
-    extremes: Extremes
-    broken: tuple[Integers, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class _Alone(Frozen):
-    """A path of a problem with noise that only Python evaluates."""
-
-    problem: OptimalControlProblem
-    policy: LinearPolicy
-    seeds: Children
-    path: int
-
-
 def monte_carlo(
     problem: OptimalControlProblem,
     policy: LinearPolicy,
@@ -181,114 +151,56 @@ def monte_carlo(
     """See :meth:`Solution.monte_carlo`; for any policy. ``within`` is what no path shows of the noise within steps."""
     paths = count("paths", paths, least=2)
     told_motion("progress", progress, "paths done, paths in all")
-    costs: list[Floats] = []
-    found: tuple[Finding, ...] = ()
+    every = Paths.of(problem, policy, children(rng, paths), paths)
+    parts: list[Found] = []
     extremes: Extremes = {}
-    done, bare = 0, sent(problem)
-    broken = [np.zeros(bound.shape, dtype=np.int64) for bound in _with_margins(problem)]
+    done = 0
 
-    def add(part: _Costs) -> None:
+    def add(part: Found) -> None:
         nonlocal extremes, done
-        for total, counted in zip(broken, part.broken, strict=True):
-            np.add(total, counted, out=total)
-        costs.append(part.values)
+        parts.append(part)
         extremes = greater(extremes, part.extremes)
-        done += len(part.values)
+        done += len(part.costs)
+
+    def warned(found: Sequence[Finding]) -> MonteCarlo | None:
+        result = _mean(parts, predicted, within, problem)
+        return None if result is None else replace(result, warnings=(*_lost(result), *found))
 
     with executing(executor, workers) as pool:
-        seeds = children(rng, paths)
-        q0, v0 = (np.broadcast_to(x, (paths, x.size)) for x in (bare.q0, bare.v0))
-        shared = shared_by(bare, policy, seeds)
+        q0, v0 = (np.broadcast_to(x, (paths, x.size)) for x in (problem.q0, problem.v0))
+        # Custom functions need not be thread-safe.
+        serial = every.shared is None and executor is None
+        results = (simulated(one) for one in every.chunks()) if serial else in_order(pool, simulated, every.chunks())
+        found: tuple[Finding, ...] = ()
         try:
-            parts: Generator[_Costs, None, None]
-            if shared is not None:
-                parts = in_order(pool, _together, chunks_of(bare, shared, 0, paths))
-            elif executor is not None:
-                parts = in_order(pool, _alone, (_Alone(bare, policy, seeds, path) for path in range(paths)))
-            else:
-                # Custom functions need not be thread-safe.
-                parts = (_alone(_Alone(bare, policy, seeds, path)) for path in range(paths))
-            with closing(parts):
-                take_all(parts, add, lambda: progress(done, paths) if progress is not None else None)
-            if shared is not None:
-                found = looked_at(pool, shared, q0, v0, extremes)
-            elif np.isfinite(costs[0]).all():
-                found = _look_alone(_Alone(bare, policy, seeds, 0))
+            with closing(results):
+                take_all(results, add, lambda: progress(done, paths) if progress is not None else None)
+            if every.shared is not None:
+                found = looked_at(pool, every.shared, q0, v0, extremes)
+            elif np.isfinite(parts[0].costs).all():
+                found = _look_alone(every)
         except KeyboardInterrupt:
-            so_far = _mean(costs, predicted, within, problem, broken)
-            if so_far is None:
-                raise MonteCarloInterrupted(None) from None
-            if shared is not None:
-                found = looked_at_here(shared, q0[:done], v0[:done], extremes)
-            elif np.isfinite(costs[0]).all():
+            if every.shared is not None and done > 1:
+                found = looked_at_here(every.shared, q0[:done], v0[:done], extremes)
+            elif done > 1 and np.isfinite(parts[0].costs).all():
                 # A second Ctrl-C skips the check.
                 with suppress(KeyboardInterrupt):
-                    found = _look_alone(_Alone(bare, policy, seeds, 0))
-            raise MonteCarloInterrupted(_warned(so_far, (*_lost(so_far), *found))) from None
-    result = _mean(costs, predicted, within, problem, broken)
+                    found = _look_alone(every)
+            raise MonteCarloInterrupted(warned(found)) from None
+    result = warned(found)
     if result is None:
         raise VarpinError(f"fewer than two of {paths} paths got to the end; a smaller dt may help")
-    found = (*_lost(result), *found)
-    announce(logger, problem.scene.announced, problem.dt, found)
-    return _warned(result, found)
+    announce(logger, problem.scene.announced, problem.dt, result.warnings)
+    return result
 
 
-def _together(chunk: Chunk) -> _Costs:
-    part = simulate_paths(chunk.task)
-    stored = part.stored
-    u = stored["u_nodes" if chunk.problem.linear else "u"]
-    values = chunk.problem.costs(stored["q"], stored["v"], u)
-    return _Costs(values, part.extremes, _broken(chunk.problem, stored["q"], stored["v"], np.isfinite(values)))
-
-
-def _alone(given: _Alone) -> _Costs:
-    (child,) = given.seeds.generators(given.path, given.path + 1)
-    try:
-        motion = given.problem.simulate(given.policy, rng=child)
-    except (StepFailure, NoiseError):
-        nothing = np.zeros((0, *given.problem.q0.shape))
-        return _Costs(np.full(1, np.nan), {}, _broken(given.problem, nothing, nothing, np.zeros(0, dtype=bool)))
-    value = np.array([given.problem.cost_of(motion)])
-    return _Costs(value, {}, _broken(given.problem, motion.q[None], motion.v[None], np.isfinite(value)))
-
-
-def _with_margins(problem: OptimalControlProblem) -> list[BoundConstraint]:
-    """The constraints with a margin, which are all on the state."""
-    return [bound for bound in problem.bound_constraints if bound.source.margin > 0.0]
-
-
-def _broken(problem: OptimalControlProblem, q: Floats, v: Floats, finished: NDArray[np.bool_]) -> tuple[Integers, ...]:
-    """Number of finished paths (C, N + 1, n) that violate each constraint with a margin, by place and row."""
-    no_controls, found = np.zeros((problem.decisions, problem.scene.controls)), []
-    for bound in _with_margins(problem):
-        count = np.zeros(bound.shape, dtype=np.int64)
-        for path in np.flatnonzero(finished):
-            count += bound.value(q[path], v[path], no_controls) > 0.0
-        found.append(count)
-    return tuple(found)
-
-
-def _reports(problem: OptimalControlProblem, broken: Sequence[Integers], paths: int) -> tuple[Broken, ...]:
-    found = []
-    for bound, counts in zip(_with_margins(problem), broken, strict=True):
-        place, row = np.unravel_index(int(counts.argmax()), counts.shape)
-        where = bound.rows[row], float(bound.times[place])
-        found.append(
-            Broken(problem.label_of(bound.source), *where, int(counts.max()), paths, float(ndtr(-bound.source.margin)))
-        )
-    return tuple(found)
-
-
-def _look_alone(given: _Alone) -> tuple[Finding, ...]:
-    """Findings about the first path."""
-    (child,) = given.seeds.generators(given.path, given.path + 1)
-    motion = given.problem.simulate(given.policy, rng=child)
+def _look_alone(paths: Paths) -> tuple[Finding, ...]:
+    """Findings about the first path, whose noise Python evaluates."""
+    motion, scene, policy = path_of(paths), paths.problem.scene, paths.policy
     # The loop's check is for held controls.
-    hold = None if given.problem.linear else given.policy.hold_at(given.problem.dt)
-    scene, policy = given.problem.scene, given.policy
-    loop = () if hold is None else unstable_loop(scene, motion, hold)
-    found = (*loop, *check(scene, given.problem.integrator, motion, policy).warnings)
-    return tuple(finding.about(f"path {given.path}: ") for finding in found)
+    loop = () if paths.problem.linear else unstable_loop(scene, motion, policy.hold_at(paths.problem.dt))
+    found = (*loop, *check(scene, paths.problem.integrator, motion, policy).warnings)
+    return tuple(finding.about("path 0: ") for finding in found)
 
 
 def _lost(result: MonteCarlo) -> tuple[Finding, ...]:
@@ -299,26 +211,25 @@ def _lost(result: MonteCarlo) -> tuple[Finding, ...]:
     return (Finding("failed paths", f"{lost}; a smaller dt may help"),)
 
 
-def _warned(result: MonteCarlo, found: Sequence[Finding]) -> MonteCarlo:
-    return replace(result, warnings=tuple(found))
-
-
-def _mean(
-    costs: Sequence[Floats],
-    predicted: float,
-    within: float,
-    problem: OptimalControlProblem,
-    broken: Sequence[Integers],
-) -> MonteCarlo | None:
-    values = np.concatenate([np.zeros(0), *costs])
-    good = values[np.isfinite(values)]
+def _mean(parts: Sequence[Found], predicted: float, within: float, problem: OptimalControlProblem) -> MonteCarlo | None:
+    """The result of the paths so far; None if fewer than two are finished."""
+    if not parts:
+        return None
+    found = joined(parts, 0)
+    good = found.costs[np.isfinite(found.costs)]
     if len(good) < 2:
         return None
+    broken = []
+    for bound, counts in zip(with_margins(problem), found.counts, strict=True):
+        place, row = np.unravel_index(int(counts.argmax()), counts.shape)
+        where = bound.rows[row], float(bound.times[place])
+        often, promised = int(counts.max()), float(ndtr(-bound.source.margin))
+        broken.append(Broken(problem.label_of(bound.source), *where, often, len(good), promised))
     return MonteCarlo(
         cost=float(good.mean()) + within,
         standard_error=float(good.std(ddof=1) / np.sqrt(len(good))),
         predicted=predicted,
         paths=len(good),
-        failures=len(values) - len(good),
-        broken=_reports(problem, broken, len(good)),
+        failures=len(found.costs) - len(good),
+        broken=tuple(broken),
     )

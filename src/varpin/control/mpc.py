@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats
 from varpin.control import OptimalControlProblem, Solution, looked_at, solve
 from varpin.control.between_nodes import enforced, middles
-from varpin.control.chatter import alternation
+from varpin.control.checks import restlessness
 from varpin.control.constraints import BoundRate
 from varpin.control.costs import CostError
 from varpin.control.history import Status
@@ -334,7 +334,7 @@ class Mpc:
             *noise_forgotten(plant.scene, rng),
             *unstable_loop(plant.scene, motion, plant.substeps),
             *motion.warnings,
-            *_alternating(motion, plant.substeps),
+            *_restless(motion, plant.substeps),
             *loop.late_ticks(),
             *loop.failed_ticks(),
             *violated,
@@ -515,14 +515,17 @@ def _require_fit(plant: Scene, planned: Scene) -> None:
             raise InputError(f"the plant has other {what} than the problem: {of(plant)}, not {of(planned)}")
 
 
-def _alternating(motion: Trajectory, substeps: int) -> tuple[Finding, ...]:
-    """A finding if the plant's velocities alternate from tick to tick."""
-    found = None if motion.dw.any() else alternation(motion.v[::substeps])
+def _restless(motion: Trajectory, substeps: int) -> tuple[Finding, ...]:
+    """A finding if a velocity of the plant goes up and down from tick to tick."""
+    found = None if motion.dw.any() else restlessness(motion.v[::substeps])
     if found is None:
         return ()
-    seen = found.sentence(motion.joint_names, motion.t[::substeps], "tick")
-    text = f"{seen}: use a smaller dt, or a greater weight on the controls or on their changes"
-    return (Finding("alternating ticks", text, motion.joint_names[found.joint]),)
+    name, ticks = motion.joint_names[found[0]], motion.steps // substeps
+    text = (
+        f"under the controller the velocity of {name} goes up and down {found[1]} times in {ticks} ticks: "
+        "a smaller dt, or a greater weight on the controls, calms it"
+    )
+    return (Finding("restless ticks", text, name),)
 
 
 def _decision(plan: Solution, age: int, q: Floats, v: Floats, before: Floats | None) -> Floats:

@@ -1,47 +1,135 @@
-"""Paths of a problem under a policy and noise, in chunks that the core integrates."""
+"""Paths of a problem under a policy and noise: their costs, and how they violate constraints with a margin."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from varpin.arrays import Floats, Integers
+from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import CostSum
 from varpin.control.problem import OptimalControlProblem
-from varpin.ensemble.paths import Shared, Task, chunks, without_geometry
+from varpin.ensemble.paths import Extremes, Shared, Task, chunks, simulate_paths, without_geometry
 from varpin.mechanics.wiener import Children
 from varpin.signals.controls import commands_of
 from varpin.signals.policy import LinearPolicy
+from varpin.simulation.failures import NoiseError, StepFailure
 from varpin.support.frozen import Frozen
+from varpin.trajectory import Trajectory
 
 
 @dataclass(frozen=True, eq=False)
-class Chunk(Frozen):
-    """A chunk of paths that the core integrates."""
+class Paths(Frozen):
+    """The paths first, ..., last - 1 of a problem under a policy.
+
+    Attributes:
+        problem: The problem.
+        policy: The policy.
+        seeds: One child of the random generator for each path.
+        shared: What the core needs for them; None where only Python evaluates the noise.
+        first: Index of the first path.
+        last: Index after the last path.
+        keep: Number of the largest values of each row of a constraint with a margin to return.
+    """
 
     problem: OptimalControlProblem
-    task: Task
+    policy: LinearPolicy
+    seeds: Children
+    shared: Shared | None
+    first: int
+    last: int
+    keep: int = 0
+
+    @classmethod
+    def of(
+        cls, problem: OptimalControlProblem, policy: LinearPolicy, seeds: Children, paths: int, keep: int = 0
+    ) -> Paths:
+        """All paths, of the problem without the robot's shapes and the cost's references, which no path needs."""
+        bare, shared = copy.copy(problem), None
+        vars(bare).update(scene=without_geometry(problem.scene), cost=CostSum(()))
+        if problem.scene.noise.diffusion is not None:
+            commands = commands_of(bare.scene, problem.integrator, policy, problem.steps, problem.dt)
+            shared = Shared(bare.scene, problem.integrator, commands, problem.dt, problem.steps, seeds)
+        return cls(bare, policy, seeds, shared, 0, paths, keep)
+
+    def chunks(self) -> Iterator[Paths]:
+        """The paths in parts: as the core integrates them, or one by one."""
+        parts = ((k, k + 1) for k in range(self.last)) if self.shared is None else chunks(self.shared.steps, self.last)
+        return (self.changed(first=first, last=last) for first, last in parts)
 
 
-def sent(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """The problem without the robot's shapes and the cost's references, which no path needs."""
-    bare = copy.copy(problem)
-    vars(bare).update(scene=without_geometry(problem.scene), cost=CostSum(()))
-    return bare
+@dataclass(frozen=True, eq=False)
+class Found(Frozen):
+    """What C paths have shown.
+
+    Attributes:
+        costs: Their costs (C,), NaN where one failed.
+        extremes: The extreme paths to check.
+        counts: Number of paths that violate each constraint with a margin, by its places and rows.
+        largest: The largest values of the same, in no order, (at most keep, K, rows).
+    """
+
+    costs: Floats
+    extremes: Extremes
+    counts: tuple[Integers, ...]
+    largest: tuple[Floats, ...]
 
 
-def shared_by(problem: OptimalControlProblem, policy: LinearPolicy, seeds: Children) -> Shared | None:
-    """What all paths share; None where only Python evaluates the noise, so that the core cannot integrate paths."""
-    if problem.scene.noise.diffusion is None:
-        return None
-    commands = commands_of(problem.scene, problem.integrator, policy, problem.steps, problem.dt)
-    return Shared(problem.scene, problem.integrator, commands, problem.dt, problem.steps, seeds)
+def simulated(paths: Paths) -> Found:
+    """Simulate a chunk of paths."""
+    problem, extremes = paths.problem, Extremes()
+    if paths.shared is not None:
+        q0, v0 = (np.tile(x, (paths.last - paths.first, 1)) for x in (problem.q0, problem.v0))
+        part = simulate_paths(Task(paths.shared, paths.first, q0, v0, store=True, moments=False))
+        extremes, stored = part.extremes, part.stored
+        q, v, u = stored["q"], stored["v"], stored["u_nodes" if problem.linear else "u"]
+    else:
+        try:
+            motion = path_of(paths)
+        except (StepFailure, NoiseError):
+            shape = 1, problem.steps + 1, problem.scene.robot.dof
+            q, v = np.full(shape, np.nan), np.full(shape, np.nan)
+            u = np.full((1, problem.steps + problem.linear, problem.scene.controls), np.nan)
+        else:
+            q, v, u = motion.q[None], motion.v[None], problem.control_rows(motion)[None]
+    costs = problem.costs(q, v, u)
+    finished = np.isfinite(costs)
+    values = [
+        bound.value(q[finished], v[finished], u[finished]) if finished.any() else np.zeros((0, *bound.shape))
+        for bound in with_margins(problem)
+    ]
+    counts = tuple((c > 0.0).sum(axis=0) for c in values)
+    return Found(costs, extremes, counts, tuple(_largest(c, paths.keep) for c in values))
 
 
-def chunks_of(problem: OptimalControlProblem, shared: Shared, begin: int, end: int) -> Iterator[Chunk]:
-    """The chunks of the paths begin, ..., end - 1 from the problem's initial state."""
-    for first, last in chunks(shared.steps, end - begin):
-        q0, v0 = (np.tile(x, (last - first, 1)) for x in (problem.q0, problem.v0))
-        yield Chunk(problem, Task(shared, begin + first, q0, v0, store=True, moments=False))
+def path_of(paths: Paths) -> Trajectory:
+    """The first of the paths, whose noise Python evaluates."""
+    (child,) = paths.seeds.generators(paths.first, paths.first + 1)
+    return paths.problem.simulate(paths.policy, rng=child)
+
+
+def joined(parts: Sequence[Found], keep: int) -> Found:
+    """What all paths have shown; the parts' extremes are left out."""
+    counts = tuple(np.sum(own, axis=0) for own in zip(*(part.counts for part in parts), strict=True))
+    largest = zip(*(part.largest for part in parts), strict=True)
+    return Found(
+        costs=np.concatenate([part.costs for part in parts]),
+        extremes={},
+        counts=counts,
+        largest=tuple(_largest(np.concatenate(own), keep) for own in largest),
+    )
+
+
+def with_margins(problem: OptimalControlProblem) -> list[BoundConstraint]:
+    """The constraints with a margin, which are all on the state."""
+    return [bound for bound in problem.bound_constraints if bound.source.margin > 0.0]
+
+
+def _largest(c: Floats, keep: int) -> Floats:
+    """The largest ``keep`` of the values (C, K, rows) of each row at each place."""
+    first = max(len(c) - keep, 0)
+    found: Floats = np.partition(c, first, axis=0)[first:] if first < len(c) else c[:0]
+    return found

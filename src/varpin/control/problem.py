@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import re
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -35,7 +35,7 @@ from varpin.finding import announce
 from varpin.integrators import Gauss, Integrator, Radau
 from varpin.integrators.registry import require_motion
 from varpin.mechanics.lagrangian import lagrangian_jet
-from varpin.mechanics.scene import Scene, closest_controls, differences, require_scene, tangent_basis
+from varpin.mechanics.scene import Scene, closest_controls, require_scene, same, tangent_basis
 from varpin.signals.commands import cubics
 from varpin.signals.inputs import as_moved
 from varpin.signals.policy import LinearPolicy, OpenLoop
@@ -49,10 +49,10 @@ from varpin.support.checks import (
     count,
     finite,
     flag,
-    is_one_of,
     joint_array,
     named_limits,
     positive,
+    word,
 )
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
@@ -68,6 +68,11 @@ Shape = Literal["held", "linear"]
 
 # Greatest rate of dampers and dry friction, times the step, for a method that is not L-stable.
 _STIFF = 10.0
+# Stages of the default integrator. Two match the cost's order; four resolve friction up to ten times as fast as the
+# step, for a third more time.
+STAGES = 4
+# Longest value in a message of a difference, in characters.
+_SHORT = 60
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -188,52 +193,35 @@ class OptimalControlProblem(Frozen):
         n, m = require_scene(scene).robot.dof, scene.controls
         if not isinstance(cost, Cost):
             raise InputError(f"cost must be a cost, for example varpin.TrackingCost(...), got {type(cost).__name__}")
-        dt, steps = time_steps(dt, steps, duration)
-        steps, hold = count("steps", steps, least=1), count("hold", hold, least=1)
-        if steps % hold:
-            raise InputError(f"steps = {steps} is no multiple of hold = {hold}")
-        if not is_one_of(sampling, ("midpoint", "gauss", "start")):
-            raise InputError(f"sampling must be 'midpoint', 'gauss' or 'start', got {sampling!r}")
-        if not is_one_of(controls, ("held", "linear")):
-            raise InputError(f"controls must be 'held' or 'linear', got {controls!r}")
-        if scene.inputs and hold != 1:
-            raise InputError(
-                "the control of a KinematicInput is its joint's position at the next node: leave hold out; the joint "
-                "moves linearly, or on a cubic, between nodes"
-            )
-        cubic = max(scene.rates, default=-1) >= 0
-        if cubic and sampling != "gauss":
-            raise InputError(
-                f"costs sampled by the rule {sampling!r} do not see the velocities of a cubic KinematicInput at the "
-                "nodes: leave sampling out, for 'gauss'"
-            )
-        if controls == "linear" and hold != 1:
-            raise InputError(
-                f"linear controls change at every node: leave hold = {hold} out, or take controls='held'", "controls"
-            )
-        if controls == "linear" and sampling != "gauss":
-            raise InputError(
-                f"costs sampled by the rule {sampling!r} do not see controls that alternate from node to node, so that "
-                "linear ones would: leave sampling out, for 'gauss'",
-                "sampling",
-            )
         if integrator is not None and not isinstance(integrator, Integrator):
             raise InputError(f"integrator must be one of varpin's, for example varpin.Gauss(4), got {integrator!r}")
         if m == 0:
             raise InputError("the scene has no controls, so there is nothing to optimize")
-        places, rule = _rule(sampling, dt, cubic=cubic)
-        times = _times(places, steps, dt)
-        t0 = finite("t0", t0)
-        points = Points(
-            t0 + times, dt * steps, steps, n, m, t0, scene.robot.joint_names, scene.control_joints, scene.robot
-        )
-        running, terminal = bind_cost(cost, t0 + times, points)
-        at, speed = joint_array("q0", q0, scene.robot.joint_names), joint_array("v0", v0, scene.robot.joint_names)
+        dt, steps = time_steps(dt, steps, duration)
+        steps, hold = count("steps", steps, least=1), count("hold", hold, least=1)
+        if steps % hold:
+            raise InputError(f"steps = {steps} is no multiple of hold = {hold}")
+        word("sampling", sampling, ("midpoint", "gauss", "start"))
+        word("controls", controls, ("held", "linear"))
+        linear, cubic = controls == "linear", max(scene.rates, default=-1) >= 0
+        if hold != 1 and (linear or scene.inputs):
+            what = "linear controls" if linear else "positions of a KinematicInput"
+            raise InputError(f"{what} are decided at every node: leave hold = {hold} out", "hold")
+        if sampling != "gauss" and (linear or cubic):
+            what = "linear controls" if linear else "a cubic KinematicInput"
+            raise InputError(
+                f"the rule {sampling!r} does not see what {what} do at the nodes: leave it out", "sampling"
+            )
+        t0, (places, rule) = finite("t0", t0), _rule(sampling, dt, cubic=cubic)
+        times = t0 + _times(places, steps, dt)
+        names = scene.robot.joint_names
+        points = Points(times, dt * steps, steps, n, m, t0, names, scene.control_joints, scene.robot)
+        running, terminal = bind_cost(cost, times, points)
+        at, speed = joint_array("q0", q0, names), joint_array("v0", v0, names)
         if scene.constraints:
             at, speed, moved = on_constraints(scene, at, speed)
             announce(logger, scene.announced, dt, moved)
-        rate = control_rate(cost, m, scene.control_joints)
-        given = _constraints(constraints)
+        rate, given = control_rate(cost, m, scene.control_joints), _constraints(constraints)
         values = {
             "scene": scene,
             "cost": cost,
@@ -254,14 +242,11 @@ class OptimalControlProblem(Frozen):
             "controls": controls,
             "between_nodes": flag("between_nodes", between_nodes),
             "integrator_by_default": integrator is None,
-            "bound_constraints": _bind_constraints(
-                given, scene, t0, dt, steps, hold, rate, linear=controls == "linear"
-            ),
+            "bound_constraints": _bind_constraints(given, scene, (t0, dt, steps, hold), rate, linear=linear),
         }
-        for name, value in values.items():
-            if isinstance(value, np.ndarray):
-                value.setflags(write=False)
-            object.__setattr__(self, name, value)
+        for value in (at, speed, rule):
+            value.setflags(write=False)
+        vars(self).update(values)
 
     def __repr__(self) -> str:
         held = f", each control held over {self.hold}" if self.hold > 1 else ", linear controls" if self.linear else ""
@@ -366,8 +351,7 @@ class OptimalControlProblem(Frozen):
         """
         if before is not None and not self.remembers:
             raise InputError(
-                "before is the control that a ControlRateCost or a WithinControlRate begins with; the problem has "
-                "neither"
+                "before is the control that a ControlRateCost or a WithinControlRate begins with: give one"
             )
         if dt is not None and steps is None and duration is None:
             steps = round(self.duration / positive("dt", dt, "s"))
@@ -375,96 +359,95 @@ class OptimalControlProblem(Frozen):
                 raise InputError(f"the horizon of {self.duration:g} s is no multiple of dt = {dt:g} s")
         elif duration is not None:
             dt, steps = time_steps(self.dt if dt is None and steps is None else dt, steps, duration)
-        given = (dt, steps, integrator, sampling, hold, controls, between_nodes)
-        if all(option is None for option in given):
-            return self._restarted(q0, v0, t0, before)
-        return OptimalControlProblem(
-            self.scene,
-            self.cost if before is None else with_control_before(self.cost, before),
-            self.q0 if q0 is None else q0,
-            self.v0 if v0 is None else v0,
-            dt=self.dt if dt is None else dt,
-            steps=self.steps if steps is None else steps,
-            integrator=integrator if integrator is not None or self.integrator_by_default else self.integrator,
-            sampling=self.sampling if sampling is None else sampling,
-            hold=self.hold if hold is None else hold,
-            t0=self.t0 if t0 is None else t0,
-            control_limits=(self.control_limits[0], self.control_limits[1]),
-            controls=self.controls if controls is None else controls,
-            constraints=self._after(before),
-            between_nodes=self.between_nodes if between_nodes is None else between_nodes,
-        )
-
-    def _after(self, before: JointValues | None) -> tuple[PlanConstraint, ...]:
-        """The constraints with another control before the horizon."""
-        if before is None:
-            return self.constraints
-        control = control_values("before", before, self.scene.control_joints, self.scene.controls)
-        return tuple(item.after(control) for item in self.constraints)
-
-    def _restarted(
-        self, q0: JointValues | None, v0: JointValues | None, t0: float | None, before: JointValues | None
-    ) -> OptimalControlProblem:
-        """The problem on the same grid; only what depends on the state or the time is rebuilt."""
-        scene, names = self.scene, self.scene.robot.joint_names
-        changed: dict[str, Any] = {}
-        for name, given in (("q0", q0), ("v0", v0)):
-            if given is not None:
-                changed[name] = joint_array(name, given, names)
-        if changed and scene.constraints:
-            at = {"q0": self.q0, "v0": self.v0, **changed}
-            changed["q0"], changed["v0"], _ = on_constraints(scene, at["q0"], at["v0"])
-        for array in changed.values():
-            array.setflags(write=False)
+        moved: dict[str, Any] = {"q0": q0, "v0": v0, "t0": t0}
+        grid: dict[str, Any] = {"dt": dt, "steps": steps, "integrator": integrator, "sampling": sampling, "hold": hold}
+        grid |= {"controls": controls, "between_nodes": between_nodes}
         if before is not None:
-            changed["constraints"] = self._after(before)
-            changed["cost"] = with_control_before(self.cost, before)
+            control = control_values("before", before, self.scene.control_joints, self.scene.controls)
+            moved["cost"] = with_control_before(self.cost, control)
+            moved["constraints"] = tuple(item.after(control) for item in self.constraints)
+        changed, other = ({k: x for k, x in given.items() if x is not None} for given in (moved, grid))
+        if not other:
+            return self._moved(changed)
+        same = {name: getattr(self, name) for name in (*moved, *grid, "cost", "constraints", "control_limits")}
+        if self.integrator_by_default:
+            same["integrator"] = None
+        return OptimalControlProblem(self.scene, **same | changed | other)
+
+    def _moved(self, changed: dict[str, Any]) -> OptimalControlProblem:
+        """The problem on the same grid, from another state, time or control; only what depends on them is rebuilt."""
+        scene, names = self.scene, self.scene.robot.joint_names
+        state = {name: joint_array(name, changed[name], names) for name in ("q0", "v0") if name in changed}
+        if state and scene.constraints:
+            at = {"q0": self.q0, "v0": self.v0} | state
+            state["q0"], state["v0"], _ = on_constraints(scene, at["q0"], at["v0"])
+        for array in state.values():
+            array.setflags(write=False)
+        changed = changed | state
+        if "cost" in changed:
             changed["rate"] = control_rate(changed["cost"], scene.controls, scene.control_joints)
-        if t0 is not None and finite("t0", t0) != self.t0:
-            changed["t0"] = t0 = finite("t0", t0)
+        if "t0" in changed:
+            changed["t0"] = t0 = finite("t0", changed["t0"])
             times = t0 + _times(self.places, self.steps, self.dt)
             points = replace(self.running.points, t=times, t0=t0)
             changed["running"], changed["terminal"] = bind_cost(self.cost, times, points, (self.running, self.terminal))
+        found = self.changed(**changed)
         if self.constraints and ("constraints" in changed or "t0" in changed):
-            rate, t0 = changed.get("rate", self.rate), changed.get("t0", self.t0)
-            grid = (t0, self.dt, self.steps, self.hold)
-            constraints = changed.get("constraints", self.constraints)
-            changed["bound_constraints"] = _bind_constraints(constraints, scene, *grid, rate, linear=self.linear)
-        problem = object.__new__(type(self))
-        # The dataclass is frozen: attributes are set in its dictionary.
-        vars(problem).update(vars(self) | changed)
-        return problem
+            grid = found.t0, found.dt, found.steps, found.hold
+            bound = _bind_constraints(found.constraints, scene, grid, found.rate, linear=self.linear)
+            vars(found)["bound_constraints"] = bound
+        return found
 
-    def differs(self, other: OptimalControlProblem) -> str:
-        """The first difference between two problems in words, costs aside; empty if there is none."""
-        robot, its = self.scene.robot, other.scene.robot
-        if robot.joint_names != its.joint_names:
-            return f"joints {', '.join(its.joint_names)}, not {', '.join(robot.joint_names)}"
-        if not np.array_equal(robot.tree.mass, its.tree.mass):
-            return f"links of {its.tree.mass.sum():.6g} kg, not {robot.tree.mass.sum():.6g} kg"
-        options = ("hold", "controls", "between_nodes", "sampling")
-        for name in ("dt", "steps", *options, "q0", "v0", "integrator", "control_limits"):
-            mine, theirs = getattr(self, name), getattr(other, name)
-            if not np.array_equal(mine, theirs):
-                return f"{name} = {theirs}, not {mine}"
-        for name in ("gravity", "damping", "stiffness", "rest", "armature", "actuation"):
-            if not np.array_equal(getattr(self.scene, name), getattr(other.scene, name)):
-                return f"another {name}"
-        forces = [sorted([*scene.elements, *scene.couplings], key=repr) for scene in (self.scene, other.scene)]
-        custom = [scene.custom.parts if scene.custom else () for scene in (self.scene, other.scene)]
-        functions = [[(part.f, part.derivatives) for part in parts] for parts in custom]
-        if forces[0] != forces[1] or functions[0] != functions[1]:
-            return "other forces"
-        if self.described_constraints != other.described_constraints:
-            return "other constraints"
-        return next(iter(differences(self.scene, other.scene.values, noise=True)), "")
+    def in_parts(self, parts: int) -> OptimalControlProblem:
+        """The problem in ``parts`` of each step, for motions under commands that are decided as in its own steps.
+
+        Costs are sampled by the rule "gauss". It is not to be solved: the controls of kinematic inputs, and linear
+        ones, are those of the parts.
+        """
+        dt, steps = self.dt / parts, self.steps * parts
+        places, rule = _rule("gauss", dt, cubic=max(self.scene.rates, default=-1) >= 0)
+        times = self.t0 + _times(places, steps, dt)
+        running, terminal = bind_cost(self.cost, times, self.running.points)
+        return self.changed(
+            dt=dt,
+            steps=steps,
+            hold=1 if self.linear else self.hold * parts,
+            sampling="gauss",
+            rule=rule,
+            running=running,
+            terminal=terminal,
+            bound_constraints=self.constraints_on(dt, steps, self.hold * parts),
+        )
+
+    @cached_property
+    def setting(self) -> dict[str, Any]:
+        """What tells the problem from others, costs aside: numbers and texts by name; noise in Python by its size."""
+        names = ("dt", "steps", "hold", "controls", "between_nodes", "sampling", "q0", "v0", "t0", "control_limits")
+        found: dict[str, Any] = {name: getattr(self, name) for name in names}
+        found["joints"] = ", ".join(self.scene.robot.joint_names)
+        noise = self.scene.diffusion._asdict()
+        values = {name: array for name, array in self.scene.values.items() if not name.startswith("noise.")}
+        found |= {f"scene.{name}": array for name, array in values.items()}
+        found |= {f"noise.{name}": array for name, array in noise.items()}
+        return found | {"constraints": self.described_constraints, "integrator": repr(self.integrator)}
+
+    def differs(self, setting: Mapping[str, Any]) -> str:
+        """The first difference from a problem of another :attr:`setting` in words; empty if there is none."""
+        for name in dict.fromkeys((*self.setting, *setting)):
+            theirs, mine = (np.asarray(one.get(name, np.zeros(0))) for one in (setting, self.setting))
+            texts = mine.dtype.kind == "U" or theirs.dtype.kind == "U"
+            if np.array_equal(theirs, mine) if texts else same(theirs, mine):
+                continue
+            short = max(len(str(theirs)), len(str(mine))) <= _SHORT
+            return f"{name} = {theirs}, not {mine}" if short else f"different {name.replace('.', ' ')}"
+        return ""
 
     def constraints_on(
         self, dt: float, steps: int, hold: int, *, linear: bool | None = None
     ) -> tuple[BoundConstraint, ...]:
         """The constraints on another grid, and for controls that are ``linear`` between nodes or held."""
         lines = self.linear if linear is None else linear
-        return _bind_constraints(self.constraints, self.scene, self.t0, dt, steps, hold, self.rate, linear=lines)
+        return _bind_constraints(self.constraints, self.scene, (self.t0, dt, steps, hold), self.rate, linear=lines)
 
     def label_of(self, constraint: PlanConstraint) -> str:
         """The name of one of the constraints in reports, with its index where several have the same name."""
@@ -527,17 +510,35 @@ class OptimalControlProblem(Frozen):
         n, m = self.scene.robot.dof, self.scene.controls
         R = self.steps if self.linear else self.decisions
         on: Literal["momentum", "velocity"] = "momentum" if self.integrator.variational else "velocity"
-        feedback = self.holding_feedback(on)
-        gains = np.zeros((R, m, 2 * n)) if feedback is None else np.tile(feedback, (R, 1, 1))
-        u = np.tile(self.holding_controls(), (R, 1))
+        feedback, u = self.holding_feedback(on), self.holding_controls()
+        gains = np.zeros((m, 2 * n)) if feedback is None else feedback
+        reference = np.append(self.q0, np.zeros(n))
+        rows = (np.tile(u, (R, 1)), np.tile(gains, (R, 1, 1)), np.tile(reference, (R, 1)))
+        return self.policy_of(*rows, on, before=u if self.linear else None)
+
+    def policy_of(
+        self,
+        u: Floats,
+        gains: Floats,
+        reference: Floats,
+        on: Literal["momentum", "velocity"],
+        *,
+        before: JointValues | None,
+        previous_gains: Floats | None = None,
+        previous: Floats | None = None,
+        substeps: int = 1,
+    ) -> LinearPolicy:
+        """A policy of the problem's decisions, in ``substeps`` parts of its steps."""
         return LinearPolicy(
             u,
             gains,
-            np.tile(np.append(self.q0, np.zeros(n)), (R, 1)),
-            hold=self.hold,
+            reference,
+            hold=self.hold * substeps,
             on=on,
             limits=(self.control_limits[0], self.control_limits[1]),
-            before=self.holding_controls() if self.linear else None,
+            previous_gains=previous_gains,
+            previous=previous,
+            before=before,
             period=self.period,
             joints=self.scene.control_joints,
             servos=self.scene.servo_joints,
@@ -580,8 +581,14 @@ class OptimalControlProblem(Frozen):
 
     def _at_rest(self) -> tuple[Floats, Floats, Floats]:
         """M and L_qq less that of the constraint forces (n, n), at rest at q0, and a basis of the motions (n, t)."""
-        jet = lagrangian_jet(self.scene, self.q0, np.zeros(self.scene.robot.dof))
-        return jet.Lvv, self._static_curvature(jet.Lqq), tangent_basis(self.scene, self.q0)
+        scene, q = self.scene, self.q0
+        jet, basis = lagrangian_jet(scene, q, np.zeros(q.size)), tangent_basis(scene, q)
+        if not scene.constraints:
+            return jet.Lvv, jet.Lqq, basis
+        (C,) = scene.core.constraints(q[None])[2]
+        left = scene.actuation @ self.holding_controls() - scene.static_pull(q)
+        y = np.linalg.lstsq(C.T, left, rcond=1e-9)[0]
+        return jet.Lvv, jet.Lqq - scene.core.constraint_curvature(q, y, np.zeros(q.size))[0], basis
 
     def decided(self, trajectory: Trajectory) -> Floats:
         """The controls (R, m) of a motion on the problem's grid, one row per decision."""
@@ -590,17 +597,6 @@ class OptimalControlProblem(Frozen):
     def control_rows(self, trajectory: Trajectory) -> Floats:
         """The controls of a motion as :meth:`samples` takes them."""
         return trajectory.u_nodes if self.linear else trajectory.u
-
-    def _static_curvature(self, Lqq: Floats) -> Floats:
-        """L_qq - y . g_qq, with y the constraint forces where the robot is held at rest at q0."""
-        if not self.scene.constraints:
-            return Lqq
-        scene, q = self.scene, self.q0
-        (C,) = scene.core.constraints(q[None])[2]
-        left = scene.actuation @ self.holding_controls() - scene.static_pull(q)
-        y = np.linalg.lstsq(C.T, left, rcond=1e-9)[0]
-        curvature: Floats = Lqq - scene.core.constraint_curvature(q, y, np.zeros(q.size))[0]
-        return curvature
 
     def samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
         """States and controls at the running costs' samples, the s samples of a step one after another.
@@ -635,14 +631,11 @@ class OptimalControlProblem(Frozen):
         require_motion(self.scene, trajectory)
         if self.linear and not trajectory.u_nodes.shape[1]:
             raise InputError(
-                "the motion has no controls at nodes, and the problem's are linear between them: take the motion of a "
-                "plan, or of its policy, plan.policy.without_feedback()"
+                "the problem's controls are linear, the motion's are not: take plan.policy.without_feedback()"
             )
         if trajectory.steps != self.steps or abs(trajectory.dt - self.dt) > 1e-12 * self.dt:
-            raise InputError(
-                f"the motion has {trajectory.steps} steps of {trajectory.dt:g} s; "
-                f"the problem {self.steps} of {self.dt:g} s"
-            )
+            grids = (f"{grid.steps} steps of {grid.dt:g} s" for grid in (trajectory, self))
+            raise InputError(f"the motion has {next(grids)}; the problem {next(grids)}")
         return float(self.shares(trajectory).sum())
 
     def shares(self, trajectory: Trajectory) -> Floats:
@@ -729,34 +722,24 @@ class OptimalControlProblem(Frozen):
         return self.terminal.expand(trajectory.q[-1:], trajectory.v[-1:], np.zeros((1, self.scene.controls)))
 
 
-def default_integrator() -> Gauss:
-    """The default integrator of plans without stiff friction, in Python and in scene files.
-
-    Two stages match the cost's order. Light joints with friction need more, as their velocities settle within a
-    fraction of a step. Four stages resolve friction up to ten times as fast as the step, for a third more time than
-    two.
-    """
-    return Gauss(stages=4)
-
-
 def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
-    """The integrator of a problem that gives none: the default, with three stages in calm steps, or the L-stable one.
+    """The integrator of a problem that gives none: Gauss's, with three stages in calm steps, or the L-stable one.
 
     Three stages where no swing or damper of the start is fast in a step, so that :func:`varpin.simulate` takes two: in
     reaches of four arms their plans lost at most 4e-5 more than those of four, in three quarters of the time.
 
     A mode z times as fast as the step decays by the factor 1 - 40 / z in a step of Gauss(4), and rings after each jump
     of a held control. In reaches of damped arms, plans of the L-stable method lose less from z = 10 on, and those of
-    the default up to 5. With constraints of the scene it is always the default, since Radau's methods do not support
-    them. Noise is held over the step: in the long steps of plans an impulse costs two to five times as much.
+    the default up to 5. Radau's methods do not support constraints of the scene. Noise is held over the step: in the
+    long steps of plans an impulse costs two to five times as much.
     """
-    kick, stages = usual_kick(scene), default_integrator().stages
+    kick = usual_kick(scene)
     if not scene.constraints and dt * rate_at_rest(scene, q0) > _STIFF:
-        return Radau(stages, kick=kick)
+        return Radau(STAGES, kick=kick)
     if scene.constraints or scene.custom is not None:
-        return Gauss(stages, kick=kick)
+        return Gauss(STAGES, kick=kick)
     usual = usual_integrator(scene, q0, np.zeros_like(q0), dt, noisy=False)
-    return Gauss(3 if usual == Gauss(2, kick=kick) else stages, kick=kick)
+    return Gauss(3 if usual == Gauss(2, kick=kick) else STAGES, kick=kick)
 
 
 def _control_limits(given: tuple[JointValues, JointValues] | None, scene: Scene) -> Floats:
@@ -783,17 +766,15 @@ def _constraints(given: Sequence[PlanConstraint]) -> tuple[PlanConstraint, ...]:
 def _bind_constraints(
     constraints: tuple[PlanConstraint, ...],
     scene: Scene,
-    t0: float,
-    dt: float,
-    steps: int,
-    hold: int,
+    grid: tuple[float, float, int, int],
     rate: ControlRate | None,
     *,
     linear: bool,
 ) -> tuple[BoundConstraint, ...]:
-    """Bind constraints to a grid."""
+    """Constraints on a grid: of t0, dt, steps and hold."""
     if not constraints:
         return ()
+    t0, dt, steps, hold = grid
     times = t0 + np.arange(steps + 1, dtype=np.float64) * dt
     before = None if rate is None else rate.before
     horizon = Horizon(times, scene.robot, scene.controls, hold, scene.control_joints, before, linear)

@@ -72,6 +72,8 @@ _MET, _APPROACHED = 1e-6, 0.9
 _CLOSE = 1e-3
 # How often margins are widened by counting motions.
 _COUNTS = 3
+# How often margins may follow the motion, and by which share of themselves they have to; the latter from 1e-4 to 1e-2.
+_ROUNDS, _MOVES = 30, 1e-3
 # Greatest number of halvings of a trial's steps beyond those that the present motion needs; from 2 to 6.
 _HALVINGS = 4
 # Multipliers that are no more than that, relative to the largest, distances from a limit, relative to it, and falls of
@@ -128,6 +130,7 @@ class Search:
         self.exact = self.unsolved = False
         self.stages: Stages | None = None
         self._passes = 0  # backward passes since the last entry of the history
+        self._due, self._rounds = False, 0  # margins are to be taken; how often they have followed the motion
         robot = problem.scene.robot.name
         self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {problem.t0:g} s"
         self._enforce(NOWHERE)
@@ -187,7 +190,7 @@ class Search:
                 self.reason = str(error)
                 return Status.NOT_DIFFERENTIABLE
             close = ended is None and self._known.decrease <= _CLOSE * stake.moved
-            if (close or ended is Status.CONVERGED) and self._goes_on(ended):
+            if (close or ended in (Status.CONVERGED, Status.INFEASIBLE)) and self._goes_on(ended):
                 continue
             ended = ended or self._out_of(last, deadline)
             if ended is not None:
@@ -294,7 +297,7 @@ class Search:
             self.noise = self._pass(0.0) or plan
         if self._has_goals:
             self.plan = self._pass_to_goals() or plan
-        if problem.processes and not self.tick:
+        if self._due and problem.processes and not self.tick:
             self._take_margins(self.plan)
         # The step is the pass's own, where that keeps to all limits and rows.
         plain = self.regularization == 0.0 and not self._has_goals
@@ -406,6 +409,7 @@ class Search:
 
     def _take_margins(self, plan: Plan) -> None:
         """Margins of all rows, in their units: standard deviations under the plan's feedback, and what is added."""
+        self._due = False
         kept = [item for item in self.bound if item.source.margin > 0.0]
         if not kept:
             return
@@ -484,12 +488,18 @@ class Search:
         """Whether there are further rows between nodes, or wider margins, before a search ends."""
         if self.tick:
             return False
+        if ended is not None and self._margins_move():
+            self.since, self.reason = len(self.history), ""
+            return True
+        if ended is Status.INFEASIBLE:
+            return False
         count = len(self.problem.bound_constraints)
         made = followed(self.problem, self.between, self.trajectory, self.backoff[:count])
         if made is not self.between:
             kept, margins = self.multipliers[:count], self.backoff[:count]
             self._enforce(made)
             self.multipliers[:count], self.backoff[:count] = kept, margins
+            self._due = any(part.any() for part in margins)
         elif ended is None or not self._counts_motions():
             return False
         self.since = len(self.history)
@@ -503,9 +513,27 @@ class Search:
         self.counts += 1
         more = None
         with contextlib.suppress(VarpinError):
-            more = widened(self.solution(Status.CONVERGED), self.deadline)
-        self.added = self.added if more is None else more
+            more = widened(self.solution(Status.CONVERGED))
+        self.added, self._due = (self.added, self._due) if more is None else (more, True)
         return more is not None
+
+    def _margins_move(self) -> bool:
+        """Whether the margins of the motion are others than those that it was found with; they then follow it.
+
+        In between they stay: a merit whose rows move with the motion has no minimum. The first search is without them.
+        """
+        if self.plan is None or not self.problem.processes or self._rounds >= _ROUNDS:
+            return False
+        before = list(self.backoff)
+        self._take_margins(self.plan)
+        if all((np.abs(b - a) <= _MOVES * a).all() for a, b in zip(before, self.backoff, strict=True)):
+            self.backoff = before
+            return False
+        if any(part.any() for part in before):
+            # Half of the way: a motion far from its rows has small margins, which let it come near again.
+            self.backoff = [0.5 * (a + b) for a, b in zip(before, self.backoff, strict=True)]
+        self._rounds += 1
+        return True
 
     def _line_search(self) -> Taken:
         """Move to the trial along the step whose merit, (O11), a line search accepts, if any."""

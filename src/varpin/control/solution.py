@@ -27,7 +27,7 @@ from varpin.finding import Finding
 from varpin.linearization import velocity_at_nodes
 from varpin.model import joint_unit
 from varpin.signals.policy import LinearPolicy
-from varpin.support.checks import JointValues, count, is_one_of, positive
+from varpin.support.checks import JointValues, count, positive, word
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, folded, listed, table, warning_count
 from varpin.trajectory import Trajectory
@@ -75,7 +75,7 @@ class Solution(Frozen):
     reg        Regularization, relative to the diagonal of Quu; 0 where the model needs none.
     step       Length of the accepted step, 0 where there is none, as at the end; above 1 where the cost
                falls on beyond the model's minimum.
-    rollouts   Number of trials of the line search.
+    trials     Number of trials of the line search; * stands for second derivatives of the dynamics.
     ========== =====================================================================================
 
     ``print(plan.verify())`` shows the plan's cost on the continuous system, ``print(plan.monte_carlo(200, rng=0))`` its
@@ -182,7 +182,7 @@ class Solution(Frozen):
         )
 
     def _repr_html_(self) -> str:
-        problem, beyond, motion = self.problem, self.violations, self.trajectory
+        problem, beyond, robot = self.problem, self.violations, self.problem.scene.robot
         rows: list[tuple[str, object]] = [
             ("status", self.status.value),
             ("why", self.reason),
@@ -190,28 +190,20 @@ class Solution(Frozen):
             ("iterations", f"{self.iterations} in {sum(item.seconds for item in self.history):.3g} s"),
             ("horizon", f"{problem.steps} steps of {problem.dt:g} s, {problem.integrator}"),
         ]
-        if self.history:
-            rows.insert(4, ("gradient", f"{self.history[-1].gradient:.2e} at most in the end"))
-        names = problem.scene.robot.joint_names
-        robot = problem.scene.robot
-        units = joint_unit(robot), joint_unit(robot, speed=True)
-        for what, unit, part in zip(("position", "velocity"), units, (beyond.position, beyond.velocity), strict=True):
-            over = [f"{name} {value:.3g}" for name, value in zip(names, part, strict=True) if value]
+        for what, part in (("position", beyond.position), ("velocity", beyond.velocity)):
+            over = [f"{name} {value:.3g}" for name, value in zip(robot.joint_names, part, strict=True) if value]
             if over:
+                unit = joint_unit(robot, speed=what == "velocity")
                 rows.append((f"{what} beyond limits [{unit}]", listed(over)))
         if beyond.control.any():
             rows.append(("controls beyond limits", f"{beyond.control.max():.3g} at most"))
         rows += [("constraint", report) for report in self.constraints]
         rows += [("warning", warning) for warning in self.warnings]
-        most = np.abs(problem.control_rows(motion)).max(axis=0, initial=0.0)
+        most = np.abs(problem.control_rows(self.trajectory)).max(axis=0, initial=0.0)
         rows.append(("largest controls", listed(f"{value:.4g}" for value in most)))
-        columns = ("", "cost", "noise cost", "expected", "decrease", "gradient", "regularization", "step", "rollouts")
-        history = [
-            (x.index, f"{x.cost:.6e}", *map(float, (x.noise_cost, x.expected_decrease, x.decrease, x.gradient)),
-             x.regularization, x.step, x.rollouts)
-            for x in self.history
-        ]  # fmt: skip
-        return facts(f"Plan for {problem.scene.robot.name}", rows, folded("iterations", table(columns, history)))
+        history = [str(item).rstrip(" *").split() for item in self.history]
+        columns = Iteration.HEADER.replace("noise cost", "noise").split()
+        return facts(f"Plan for {robot.name}", rows, folded("iterations", table(columns, history)))
 
     def table(self) -> str:
         """The iterations, one row each, and how and why they ended; :class:`Solution` explains the columns."""
@@ -268,14 +260,13 @@ class Solution(Frozen):
         Raises:
             InputError: ``x`` is neither "momentum" nor "velocity".
         """
-        if not is_one_of(x, ("momentum", "velocity")):
-            raise InputError(f"x must be 'momentum' or 'velocity', got {x!r}")
+        word("x", x, ("momentum", "velocity"))
         gains, trajectory, hold = self.gains, self.trajectory, self.problem.hold
         rows, n = slice(0, -1, hold), self.problem.scene.robot.dof
-        linear, first, previous_gains = self.problem.linear, None, self.previous_gains
+        linear, previous_gains = self.problem.linear, self.previous_gains
         if linear:
             # The first control is the value at the beginning of the first line.
-            first, gains = self.controls[0], gains[1:]
+            gains = gains[1:]
             previous_gains = None if previous_gains is None else previous_gains[1:]
         if self.problem.integrator.variational != (x == "momentum"):
             rates = velocity_at_nodes(self.problem.scene, trajectory.q[rows], trajectory.v[rows])
@@ -286,23 +277,10 @@ class Solution(Frozen):
                 gains = np.concatenate([gains[:, :, :n] - second @ by_q, second], axis=2)
             else:
                 gains = np.concatenate([gains[:, :, :n] + second @ by_q, second @ by_p], axis=2)
-        nodes = trajectory.p if x == "momentum" else trajectory.v
-        reference = np.hstack([trajectory.q[rows], nodes[rows]])
-        limits = self.problem.control_limits
-        return LinearPolicy(
-            self.controls[1:] if linear else self.controls,
-            gains,
-            reference,
-            hold * substeps,
-            x,
-            (limits[0], limits[1]),
-            previous_gains=previous_gains,
-            before=first if linear else self.problem.before,
-            linear=linear,
-            period=self.problem.period,
-            joints=self.problem.scene.control_joints,
-            servos=self.problem.scene.servo_joints,
-        )
+        reference = np.hstack([trajectory.q[rows], (trajectory.p if x == "momentum" else trajectory.v)[rows]])
+        u, before = (self.controls[1:], self.controls[0]) if linear else (self.controls, self.problem.before)
+        given = u, gains, reference, x
+        return self.problem.policy_of(*given, before=before, previous_gains=previous_gains, substeps=substeps)
 
     def verify(
         self, *, tolerance: float = 1e-10, max_substeps: int = 1024, progress: Callable[[int, int], None] | None = None
@@ -423,19 +401,8 @@ def rest_of(
         gains[beyond] = 0.0
         if previous_gains is not None:
             previous_gains[beyond] = 0.0
-    return LinearPolicy(
-        u,
-        gains,
-        reference,
-        policy.hold,
-        policy.on,
-        (policy.limits[0], policy.limits[1]),
-        previous_gains=previous_gains,
-        # A repeated control has itself as its previous one.
-        previous=None if previous_gains is None else np.vstack([expected, u[:-1]]),
-        before=before,
-        period=policy.period,
-        joints=policy.joints,
-        servos=policy.servos,
-        linear=policy.linear,
-    )
+    # A repeated control has itself as its previous one.
+    previous = None if previous_gains is None else np.vstack([expected, u[:-1]])
+    on: Literal["momentum", "velocity"] = "velocity" if policy.on == "velocity" else "momentum"
+    given = u, gains, reference, on
+    return plan.problem.policy_of(*given, before=before, previous_gains=previous_gains, previous=previous)

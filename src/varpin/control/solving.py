@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from varpin.control.examination import foreseen, looked_at
+from varpin.control.checks import foreseen, looked_at
 from varpin.control.history import ITERATIONS, Iteration, Status
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refine import SUFFICIENT, refine
@@ -190,7 +190,7 @@ def _require_resumable(problem: OptimalControlProblem, controls: object, resume:
         raise InputError("resume goes on from the solution's own controls: leave out either controls or resume")
     if resume.search is None:
         raise InputError("resume: the solution does not hold the state of its search; give it as controls")
-    difference = problem.differs(resume.problem)
+    difference = problem.differs(resume.problem.setting)
     if difference:
         raise InputError(f"resume: the solution is of another problem: {difference}; give it as controls")
     found, known = problem.cost_of(resume.trajectory), resume.cost

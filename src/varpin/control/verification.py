@@ -5,16 +5,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
-from varpin.control.costs import BoundSum
 from varpin.control.history import Status
-from varpin.control.problem import OptimalControlProblem, bind_cost
-from varpin.core import fastest_damping
+from varpin.control.problem import OptimalControlProblem
 from varpin.core.arrays import Commands
 from varpin.integrators import Gauss, Integrator, Radau, RungeKutta4
 from varpin.signals.commands import open_line, open_loop
@@ -26,12 +24,15 @@ from varpin.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
 
+# A plan's policy on (q, p) or (q, v), in parts of its steps.
+Policy: TypeAlias = Callable[[Literal["momentum", "velocity"], int], LinearPolicy]
+
 # Relative accuracy of the costs above which nothing can be concluded about the plan.
 _UNKNOWN = 0.01
-# Integrators of the continuous system, without and with fast damping.
-_USUAL, _FAST = RungeKutta4(), Radau(3)
-# Damping is fast if its rate times the plan's step exceeds _FASTER at one of _NODES nodes.
-_FASTER, _NODES = 8.0, 8
+# Integrators of the continuous system: without and with fast damping, and with constraints of the scene.
+_USUAL, _FAST, _CLOSED = RungeKutta4(), Radau(3), Gauss(stages=3)
+# Damping is fast if its rate times the plan's step is greater. Up to twice that, both integrators take as long.
+_FASTER = 8.0
 _READING = (
     "where feedback loses less than a percent, the plan holds; where it loses more, dt is too coarse (controls alone "
     "also lose much where a motion is unstable)"
@@ -40,8 +41,6 @@ _READING = (
 _FAR = 2.0
 # Least number of parts of a step in which the constraints of a plan with a wished true cost are looked at.
 _LOOKS = 8
-# Stability limit of the Runge-Kutta method: greatest product of rate and step.
-_STABLE = 2.78
 
 
 @dataclass(frozen=True)
@@ -137,16 +136,12 @@ class Verification:
 
     @property
     def _why_unknown(self) -> str:
-        finer = f"give max_substeps of {2 * self.substeps} or more"
-        if np.isinf(self.accuracy):
-            return (
-                f"these costs say nothing of the plan: those with {self.substeps} steps of {self.integrator} in one of "
-                f"the plan's were compared with no others: {finer}"
-            )
+        how = "were compared with no others"
+        if np.isfinite(self.accuracy):
+            how = f"still change by {percent(self.accuracy)}, as something is too fast"
         return (
-            f"these costs say nothing of the plan: with {self.substeps} steps of {self.integrator} in one of the "
-            f"plan's they still change by {percent(self.accuracy)}. Springs, dampers, dry friction or stops are too "
-            f"fast: {finer}, or friction a greater width"
+            f"these costs say nothing of the plan: those of {self.substeps} steps of {self.integrator} in one of the "
+            f"plan's {how}: give max_substeps of {2 * self.substeps} or more"
         )
 
     @property
@@ -207,7 +202,7 @@ def verify(
     problem: OptimalControlProblem,
     plan: Trajectory,
     planned_cost: float,
-    policy: Callable[[Literal["momentum", "velocity"], int], LinearPolicy],
+    policy: Policy,
     *,
     status: Status,
     tolerance: float,
@@ -219,24 +214,112 @@ def verify(
     The substeps double until the relative change of both costs is at most ``tolerance``. Where the explicit method does
     not reach that because of fast dampers or dry friction, the L-stable one repeats the comparison.
     """
-    found = _true_costs(problem, plan, policy, tolerance=tolerance, max_substeps=max_substeps, progress=progress)
-    end = plan.q[-1]
+    found = _on_robot(problem, plan, policy, tolerance=tolerance, max_substeps=max_substeps, progress=progress)
+    whole = _outside(problem, problem, plan, 1)
+    violations = zip(problem.bound_constraints, whole, found.opened.outside, found.closed.outside, strict=True)
     verified = Verification(
         planned_cost=planned_cost,
-        open_loop_cost=found.opened[0],
-        closed_loop_cost=found.closed[0],
-        open_loop_gap=float(np.abs(found.opened[1] - end).max()),
-        closed_loop_gap=float(np.abs(found.closed[1] - end).max()),
+        open_loop_cost=found.opened.cost,
+        closed_loop_cost=found.closed.cost,
+        open_loop_gap=float(np.abs(found.opened.end - plan.q[-1]).max()),
+        closed_loop_gap=float(np.abs(found.closed.end - plan.q[-1]).max()),
         defect=_defect(problem, plan, found.substeps, found.integrator),
         substeps=found.substeps,
         accuracy=found.accuracy,
         status=status,
         integrator=str(found.integrator),
-        constraints=_violations(problem, plan, found.ways, found.substeps, found.integrator),
+        constraints=tuple(
+            ViolationOnRobot(problem.label_of(bound.source), bound.unit, own.worst, alone.worst, fed.worst, fed.where)
+            for bound, own, alone, fed in violations
+        ),
     )
     if not verified.told:
         logger.warning("%s", verified._why_unknown)
     return verified
+
+
+class Outside(NamedTuple):
+    """The worst violation of a constraint by a motion."""
+
+    worst: float = np.nan  # in the constraint's unit; NaN where the motion diverges
+    time: float = np.nan
+    row: str = ""
+
+    @property
+    def where(self) -> str:
+        """The row and the time in words; empty without violation."""
+        return f"{self.row} at t = {self.time:.4g} s" if self.worst > 0.0 else ""
+
+
+class Played(NamedTuple):
+    """A motion under commands in parts of a plan's steps: its cost, NaN where it diverges, its end and violations."""
+
+    cost: float
+    end: Floats
+    outside: list[Outside]
+    nodes: Floats  # configurations at the plan's nodes
+
+
+def played(
+    problem: OptimalControlProblem,
+    fine: OptimalControlProblem,
+    commands: Commands,
+    integrator: Integrator,
+    margins: Sequence[Floats] | None = None,
+) -> Played:
+    """The motion of a problem under commands on ``fine``, the same :meth:`in_parts`."""
+    motion, failure = rollout(fine.scene, integrator, fine.q0, fine.v0, commands, fine.dt)
+    parts = fine.steps // problem.steps
+    if failure is not None:
+        lost = np.full((1, fine.q0.size), np.nan)
+        return Played(np.nan, lost[0], [Outside()] * len(fine.bound_constraints), lost)
+    cost = float(fine.costs(motion.q, motion.v, fine.control_rows(motion)))
+    outside = _outside(problem, fine, motion, parts, margins)
+    return Played(cost, motion.q[-1], outside, motion.q[::parts])
+
+
+def _outside(
+    problem: OptimalControlProblem,
+    fine: OptimalControlProblem,
+    motion: Trajectory,
+    parts: int,
+    margins: Sequence[Floats] | None = None,
+) -> list[Outside]:
+    """The worst violation of each constraint by a motion on ``fine``, with margins (K, rows) at the plan's nodes."""
+    found = []
+    for k, (whole, bound) in enumerate(zip(problem.bound_constraints, fine.bound_constraints, strict=True)):
+        c = bound.value(motion.q, motion.v, fine.control_rows(motion))
+        if margins is not None and not (bound.of_controls or bound.source.equality):
+            c = c + _within_steps(margins[k], parts)
+        excess = np.abs(c) if bound.source.equality else np.maximum(c, 0.0)
+        outside = at_start(problem, whole)
+        if outside is not None:
+            # A row that is violated at the start cannot hold before the first node.
+            excess[: parts - 1, outside > 0.0] = 0.0
+        sample, row = np.unravel_index(int(np.argmax(excess)), excess.shape)
+        found.append(Outside(float(excess[sample, row]), float(bound.times[sample]), bound.rows[row]))
+    return found
+
+
+def _within_steps(margin: Floats, parts: int) -> Floats:
+    """Margins (K parts, rows) in parts of steps, from those at the nodes after the first (K, rows).
+
+    Their squares are linear in time, as variances under constant noise are, and no margin is larger than at the end.
+    """
+    squares = np.concatenate([np.zeros_like(margin[:1]), margin**2])
+    share = np.arange(1, parts + 1)[:, None] / parts
+    inner = squares[:-1, None] + share * (squares[1:] - squares[:-1])[:, None]
+    found: Floats = np.minimum(np.sqrt(inner), margin[:, None]).reshape(-1, margin.shape[1])
+    return found
+
+
+def at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats | None:
+    """Rows of a state inequality at the fixed start; None for other constraints."""
+    if bound.of_controls or bound.source.equality:
+        return None
+    q, v = (np.tile(state, (problem.steps + 1, 1)) for state in (problem.q0, problem.v0))
+    c: Floats = bound.value(q, v, np.zeros((problem.steps, problem.scene.controls)))[0]
+    return c
 
 
 class OnRobot(NamedTuple):
@@ -262,7 +345,7 @@ def true_costs(
     problem: OptimalControlProblem,
     plan: Trajectory,
     planned_cost: float,
-    policy: Callable[[Literal["momentum", "velocity"], int], LinearPolicy],
+    policy: Policy,
     *,
     wish: float,
     accuracy: float,
@@ -275,31 +358,25 @@ def true_costs(
         accuracy: Relative accuracy of costs within the wish.
     """
     above = planned_cost + _FAR * wish * abs(planned_cost)
-    found = _true_costs(problem, plan, policy, tolerance=accuracy, max_substeps=max_substeps, above=above)
-    told = OnRobot(found.opened[0], found.closed[0], found.known)
-    if not problem.constraints:
-        return told
-    substeps, feedback = found.substeps, found.ways[1]
-    if substeps < _LOOKS:
-        # Motions are seen at the ends of substeps only.
-        substeps, feedback = _LOOKS, _feedback(problem, policy, found.integrator, _LOOKS)
-    bound = problem.bound_constraints
-    (beyond,) = _beyond(problem, (feedback,), substeps, found.integrator)
-    shares = [by / (10.0 * item.scale) for (by, _), item in zip(beyond, bound, strict=True)]
-    if not np.isfinite(shares).all():
-        return told._replace(violation=np.nan)
+    # Motions are seen at the ends of substeps only.
+    least = _LOOKS if problem.constraints else 2
+    found = _on_robot(problem, plan, policy, tolerance=accuracy, max_substeps=max_substeps, above=above, substeps=least)
+    told = OnRobot(found.opened.cost, found.closed.cost, found.known)
+    bounds = problem.bound_constraints
+    shares = [own.worst / (10.0 * bound.scale) for own, bound in zip(found.closed.outside, bounds, strict=True)]
+    if not shares or not np.isfinite(shares).all():
+        return told._replace(violation=np.nan if shares else 0.0)
     i = int(np.argmax(shares))
-    (worst, where), item = beyond[i], bound[i]
-    words = f"{item.source.label} is violated by {worst:.2g} {item.unit} ({where})" if where else ""
-    return told._replace(violation=shares[i], where=words)
+    own = found.closed.outside[i]
+    words = f"{bounds[i].source.label} is violated by {own.worst:.2g} {bounds[i].unit} ({own.where})"
+    return told._replace(violation=shares[i], where=words if own.where else "")
 
 
-class _TrueCosts(NamedTuple):
-    """True costs and ends (n,) under the controls alone and with feedback, and how they were found."""
+class _OnRobot(NamedTuple):
+    """A plan under its controls alone and with feedback on the continuous system, and how it was found."""
 
-    opened: tuple[float, Floats]
-    closed: tuple[float, Floats]
-    ways: tuple[Commands, Commands]
+    opened: Played
+    closed: Played
     substeps: int
     accuracy: float
     decided: bool
@@ -311,229 +388,62 @@ class _TrueCosts(NamedTuple):
         return self.accuracy <= _UNKNOWN or self.decided or not np.isfinite([self.opened[0], self.closed[0]]).any()
 
 
-def _true_costs(
+def _on_robot(
     problem: OptimalControlProblem,
     plan: Trajectory,
-    policy: Callable[[Literal["momentum", "velocity"], int], LinearPolicy],
+    policy: Policy,
     *,
     tolerance: float,
     max_substeps: int,
     progress: Callable[[int, int], None] | None = None,
     above: float = np.inf,
-) -> _TrueCosts:
-    """True costs by the explicit integrator, or by the L-stable one where dissipation keeps that from an answer."""
-    for integrator in _members(problem, plan, max_substeps):
-        found = _costs_by(
-            integrator,
-            problem,
-            plan,
-            policy,
-            tolerance=tolerance,
-            max_substeps=max_substeps,
-            progress=progress,
-            above=above,
-        )
+    substeps: int = 2,
+) -> _OnRobot:
+    """A plan on the continuous system, also where the cost with feedback is surely greater than ``above``."""
+    first, fastest = substeps, problem.dt * rate_at_rest(problem.scene, problem.q0)
+    members = (_FAST,) if fastest > _FASTER else (_USUAL, _FAST)
+    for integrator in (_CLOSED,) if problem.scene.constraints else members:
+        substeps, before = first, (np.nan, np.nan)
+        while True:
+            if progress is not None:
+                progress(substeps, max_substeps)
+            fine = problem.in_parts(substeps)
+            commands = in_parts(problem, problem.decided(plan), policy, integrator, substeps)
+            opened, closed = (played(problem, fine, each, integrator) for each in commands)
+            changes = [
+                abs(now.cost - then) / max(abs(now.cost), np.finfo(float).tiny)
+                for now, then in zip((opened, closed), before, strict=True)
+                if np.isfinite(now.cost) and np.isfinite(then)
+            ]
+            decided = closed.cost - above > abs(closed.cost - before[1])
+            before, accuracy = (opened.cost, closed.cost), max(changes, default=np.inf)
+            if decided or accuracy <= tolerance or 2 * substeps > max_substeps:
+                break
+            substeps *= 2
+        found = _OnRobot(opened, closed, substeps, accuracy, bool(decided), integrator)
         if found.known or not problem.scene.dissipates:
             break
     return found
 
 
-def _members(problem: OptimalControlProblem, plan: Trajectory, max_substeps: int) -> tuple[Integrator, ...]:
-    """The integrators of the continuous system, in the order in which they are tried."""
-    if problem.scene.constraints:
-        return (accurate(problem),)
-    fast = _fast(problem, plan) or problem.dt * rate_at_rest(problem.scene, problem.q0) >= _STABLE * max_substeps
-    return (_FAST,) if fast else (_USUAL, _FAST)
+def in_parts(
+    problem: OptimalControlProblem, controls: Floats, policy: Policy, integrator: Integrator, parts: int
+) -> tuple[Commands, Commands]:
+    """Commands in parts of a plan's steps: the controls (R, m) alone, and with feedback."""
+    variational, times = integrator.variational, integrator.stage_times
+    alone = open_line(controls, times) if problem.linear else open_loop(controls)
+    m, n = problem.scene.controls, problem.scene.robot.dof
+    fed = policy("momentum" if variational else "velocity", parts)
+    closed = fed.commands(problem.steps * parts, m, n, variational=variational, stage_times=times)
+    return alone._replace(hold=problem.hold * parts), closed
 
 
-def _costs_by(
-    integrator: Integrator,
-    problem: OptimalControlProblem,
-    plan: Trajectory,
-    policy: Callable[[Literal["momentum", "velocity"], int], LinearPolicy],
-    *,
-    tolerance: float,
-    max_substeps: int,
-    progress: Callable[[int, int], None] | None,
-    above: float,
-) -> _TrueCosts:
-    """True costs by one integrator, also where the one with feedback is surely greater than ``above``."""
-    substeps, before, decided = 2, (np.nan, np.nan), False
-    times = integrator.stage_times
-    blind = open_line(problem.decided(plan), times) if problem.linear else open_loop(problem.decided(plan))
-    while True:
-        if progress is not None:
-            progress(substeps, max_substeps)
-        costs = _fine_costs(problem, substeps)
-        opened = accurate_cost(problem, blind._replace(hold=problem.hold * substeps), substeps, costs, integrator)
-        feedback = _feedback(problem, policy, integrator, substeps)
-        closed = accurate_cost(problem, feedback, substeps, costs, integrator)
-        changes = [
-            abs(now[0] - then) / max(abs(now[0]), 1e-300)
-            for now, then in zip((opened, closed), before, strict=True)
-            if np.isfinite(now[0]) and np.isfinite(then)
-        ]
-        decided = closed[0] - above > abs(closed[0] - before[1])
-        before = opened[0], closed[0]
-        accuracy = max(changes, default=np.inf)
-        if decided or accuracy <= tolerance or 2 * substeps > max_substeps:
-            break
-        substeps *= 2
-    blind = blind._replace(hold=problem.hold * substeps)
-    return _TrueCosts(opened, closed, (blind, feedback), substeps, accuracy, bool(decided), integrator)
-
-
-def _feedback(
-    problem: OptimalControlProblem,
-    policy: Callable[[Literal["momentum", "velocity"], int], LinearPolicy],
-    integrator: Integrator,
-    substeps: int,
-) -> Commands:
-    """The commands of a plan's policy in ``substeps`` parts of each of its steps."""
-    return policy("momentum" if integrator.variational else "velocity", substeps).commands(
-        problem.steps * substeps,
-        problem.scene.controls,
-        problem.scene.robot.dof,
-        variational=integrator.variational,
-        stage_times=integrator.stage_times,
-    )
-
-
-def _violations(
-    problem: OptimalControlProblem,
-    plan: Trajectory,
-    laws: tuple[Commands, Commands],
-    substeps: int,
-    integrator: Integrator,
-) -> tuple[ViolationOnRobot, ...]:
-    """Violations of each constraint on the continuous system, under the controls alone and with feedback."""
-    if not problem.constraints:
-        return ()
-    opened, closed = _beyond(problem, laws, substeps, integrator)
-    found = []
-    for whole, (alone, _), (fed, where) in zip(problem.bound_constraints, opened, closed, strict=True):
-        planned = _excess(whole, whole.value(plan.q, plan.v, problem.control_rows(plan)))
-        label, unit = problem.label_of(whole.source), whole.unit
-        found.append(ViolationOnRobot(label, unit, float(planned.max(initial=0.0)), alone, fed, where))
-    return tuple(found)
-
-
-def _beyond(
-    problem: OptimalControlProblem, laws: Sequence[Commands], substeps: int, integrator: Integrator
-) -> list[list[tuple[float, str]]]:
-    """The largest violation of each constraint under each of some commands, and the row and time in words.
-
-    NaN where the motion diverges.
-    """
-    h = problem.dt / substeps
-    fine = problem.constraints_on(h, problem.steps * substeps, problem.hold * substeps)
-    starts = [at_start(problem, whole) for whole in problem.bound_constraints]
-    found = []
-    for law in laws:
-        motion, failure = rollout(problem.scene, integrator, problem.q0, problem.v0, law, h)
-        if failure is not None:
-            found.append([(np.nan, "")] * len(fine))
-            continue
-        of_law = []
-        for bound, outside in zip(fine, starts, strict=True):
-            excess = _excess(bound, bound.value(motion.q, motion.v, problem.control_rows(motion)))
-            if outside is not None:
-                # A row that is violated at the start cannot hold before the first node.
-                excess[: substeps - 1, outside > 0.0] = 0.0
-            sample, row = np.unravel_index(int(np.argmax(excess)), excess.shape)
-            worst = float(excess[sample, row])
-            of_law.append((worst, f"{bound.rows[row]} at t = {bound.times[sample]:.4g} s" if worst > 0.0 else ""))
-        found.append(of_law)
-    return found
-
-
-def at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats | None:
-    """Rows of a state inequality at the fixed start; None for other constraints."""
-    if bound.of_controls or bound.source.equality:
-        return None
-    q, v = (np.tile(state, (problem.steps + 1, 1)) for state in (problem.q0, problem.v0))
-    c: Floats = bound.value(q, v, np.zeros((problem.steps, problem.scene.controls)))[0]
-    return c
-
-
-def _excess(bound: BoundConstraint, c: Floats) -> Floats:
-    """Violation of a constraint with values ``c`` (K, rows)."""
-    found: Floats = np.abs(c) if bound.source.equality else np.maximum(c, 0.0)
-    return found
-
-
-def _fast(problem: OptimalControlProblem, plan: Trajectory) -> bool:
-    """Whether dampers or friction are so fast that an explicit method would need many substeps."""
-    if not problem.scene.dissipates or not plan.steps:
-        return False
-    at = np.unique(np.linspace(0, plan.steps, _NODES, dtype=np.int64))
-    forces = np.ascontiguousarray(plan.u[np.minimum(at, plan.steps - 1)] @ problem.scene.actuation.T)
-    least = _FASTER / problem.dt
-    return fastest_damping(problem.scene.core, plan.q[at], plan.v[at], forces, least) > 0.0
-
-
-def _fine_costs(problem: OptimalControlProblem, substeps: int) -> tuple[BoundSum, BoundSum]:
-    """Running and terminal costs at the nodes of a finer grid."""
-    times = np.arange(problem.steps * substeps + 1, dtype=np.float64) * (problem.dt / substeps)
-    return bind_cost(problem.cost, problem.t0 + times, problem.running.points)
-
-
-def accurate(problem: OptimalControlProblem) -> Integrator:
-    """The integrator of the continuous system: classical Runge-Kutta; with scene constraints ``Gauss(3)``."""
-    return Gauss(stages=3) if problem.scene.constraints else RungeKutta4()
-
-
-def accurate_cost(
-    problem: OptimalControlProblem,
-    commands: Commands,
-    substeps: int,
-    costs: tuple[BoundSum, BoundSum] | None = None,
-    integrator: Integrator | None = None,
-) -> tuple[float, Floats]:
-    """True cost under given commands, and the end configuration; NaN where the motion diverges.
-
-    Each of the plan's steps has ``substeps`` steps, an even number, of the integrator, by default :func:`accurate`.
-    """
-    scene, h = problem.scene, problem.dt / substeps
-    n, m = scene.robot.dof, scene.controls
-    motion, failure = rollout(scene, integrator or accurate(problem), problem.q0, problem.v0, commands, h)
-    if failure is not None:
-        return np.nan, np.full(n, np.nan)
-    running, terminal = _fine_costs(problem, substeps) if costs is None else costs
-    # Simpson's rule within each step of the plan, since held controls jump between steps.
-    if problem.linear:
-        before = after = running.value(motion.q, motion.v, motion.u_nodes)
-    else:
-        after = running.value(motion.q, motion.v, np.vstack([motion.u, motion.u[-1:]]))
-        before = running.value(motion.q, motion.v, np.vstack([motion.u[:1], motion.u]))
-    integral = h / 3.0 * (after[:-1:2] + 4.0 * after[1::2] + before[2::2]).sum()
-    end = terminal.value(motion.q[-1:], motion.v[-1:], np.zeros((1, m)))[0]
-    smooth = 0.0
-    if problem.rate is not None:
-        decided = motion.u_nodes[::substeps] if problem.linear else motion.u
-        smooth = float(problem.rate.value(decided, problem.period))
-    return float(integral + end + smooth), motion.q[-1]
-
-
-def _defect(problem: OptimalControlProblem, trajectory: Trajectory, substeps: int, integrator: Integrator) -> float:
-    """Largest distance in q between the plan's steps and accurate ones from the same nodes."""
-    scene, h, n = problem.scene, problem.dt / substeps, problem.scene.robot.dof
-    state, _ = integrator.start(scene, trajectory.q[:-1].copy(), trajectory.v[:-1].copy())
-    if problem.linear or scene.inputs:
-        off = []
-        for k in range(trajectory.steps):
-            if problem.linear:
-                line = open_line(trajectory.u_nodes[k : k + 2], integrator.stage_times)._replace(hold=substeps)
-            else:
-                line = open_loop(trajectory.u[k : k + 1])._replace(hold=substeps)
-            motion, failure = rollout(scene, integrator, trajectory.q[k], trajectory.v[k], line, h)
-            off.append(np.nan if failure else float(np.abs(motion.q[-1] - trajectory.q[k + 1]).max()))
-        return float(np.max(off))
-    # Every step is a separate path, with its control given as a force.
-    commands = open_loop(np.zeros((1, scene.controls)))._replace(hold=substeps)
-    force = trajectory.u @ scene.actuation.T
-    forces = np.ascontiguousarray(np.broadcast_to(force[:, None], (trajectory.steps, substeps, n)))
-    segments = integrator.rollout_compiled(scene, state, commands, np.zeros((0, 0, scene.processes)), forces, h)
-    lost = np.full(n, np.nan)
-    ends = np.array([segment.q[-1] if segment.failure is None else lost for segment in segments])
-    return float(np.abs(ends - trajectory.q[1:]).max())
+def _defect(problem: OptimalControlProblem, plan: Trajectory, substeps: int, integrator: Integrator) -> float:
+    """Largest distance in q between the plan's steps and accurate ones from the same nodes; NaN where one diverges."""
+    h, off = problem.dt / substeps, []
+    for k in range(plan.steps):
+        line = open_line(plan.u_nodes[k : k + 2], integrator.stage_times) if problem.linear else None
+        commands = (line or open_loop(plan.u[k : k + 1]))._replace(hold=substeps)
+        motion, failure = rollout(problem.scene, integrator, plan.q[k], plan.v[k], commands, h)
+        off.append(np.nan if failure else float(np.abs(motion.q[-1] - plan.q[k + 1]).max()))
+    return float(np.max(off, initial=0.0))

@@ -326,6 +326,13 @@ def is_one_of(value: object, words: tuple[str, ...]) -> bool:
     return isinstance(value, str) and value in words
 
 
+def word(name: str, value: object, words: tuple[str, ...]) -> None:
+    """Raise an InputError unless ``value`` is one of ``words``."""
+    if not is_one_of(value, words):
+        given = ", ".join(map(repr, words[:-1]))
+        raise InputError(f"{name} must be {given} or {words[-1]!r}, got {value!r}")
+
+
 def count(name: str, value: Any, least: int = 0) -> int:
     """``value`` as an int >= ``least``.
 

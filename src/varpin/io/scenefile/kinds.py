@@ -11,7 +11,7 @@ from typing import Any
 from varpin.control import constraints as plan
 from varpin.control import costs
 from varpin.control.costs import Cost
-from varpin.control.problem import default_integrator
+from varpin.control.problem import STAGES
 from varpin.integrators import BY_NAME, Gauss, Integrator
 from varpin.mechanics import constraints, forces
 from varpin.mechanics.constraints import Constraint, CustomConstraint
@@ -44,7 +44,7 @@ CONSTRAINTS: Mapping[str, Any] = {
 } | {"robot": lambda: "robot"}
 INTEGRATORS: Mapping[str, Callable[..., Integrator]] = {
     _word_of(name): kind for name, kind in BY_NAME.items() if name != "Reference"
-} | {"gauss": functools.partial(Gauss, stages=default_integrator().stages)}
+} | {"gauss": functools.partial(Gauss, stages=STAGES)}
 NOISE: Mapping[str, Callable[..., Noise]] = {"additive": AdditiveNoise, "control": ControlNoise, "state": StateNoise}
 PLAN_CONSTRAINTS: Mapping[str, Callable[..., plan.PlanConstraint]] = {
     "joint_limits": plan.WithinJointLimits,
