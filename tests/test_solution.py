@@ -8,7 +8,7 @@ import pytest
 from findings import about
 from naive import continuous
 from refusals import refused, unnamed
-from test_sddp import WEIGHTS, arm_problem, lq_problem, problem_without_noise, run, small
+from test_sddp import WEIGHTS, arm_problem, lq_problem, run, small
 
 import varpin as vp
 
@@ -271,13 +271,14 @@ def test_monte_carlo_interrupted_holds_the_paths_done():
     assert caught.value.result is None
 
 
-def noisy_reach(name, intensity):
+def noisy_reach(name, intensity=None):
     """To another posture, with forces that are as noisy as they are large."""
     robot = vp.load_robot(name)
     n, light = robot.dof, name == "finger"
     start = np.array([0.2, 0.3, 0.2] if light else [0.0, -1.5, 1.5, 0.0, 0.5, 0.0])
     goal = start + np.array([0.6, 0.2, 0.2] if light else [0.5, 0.3, -0.3, 0.3, 0.2, 0.2])
-    scene = vp.Scene(robot, damping=1e-6 if light else 1.0, noise=vp.ControlNoise(intensity))
+    noise = vp.ControlNoise(intensity) if intensity else None
+    scene = vp.Scene(robot, damping=1e-6 if light else 1.0, noise=noise)
     cost = (
         vp.TrackingCost(goal, 10.0)
         + vp.ControlCost(1e7 if light else 1e-3)
@@ -291,7 +292,7 @@ def noisy_reach(name, intensity):
 def test_where_noise_matters_uncut(integrator):
     """The same by ``monte_carlo`` itself, nothing cut, on the arm."""
     problem = noisy_reach("ur5", 0.13).at(integrator=integrator)
-    aware, quiet = vp.solve(problem), vp.solve(problem_without_noise(problem))
+    aware, quiet = vp.solve(problem), vp.solve(noisy_reach("ur5").at(integrator=integrator))
     plain = dataclasses.replace(quiet, problem=problem)
     ours, theirs = aware.monte_carlo(8000, 1), plain.monte_carlo(8000, 1)
     assert ours.failures == theirs.failures == 0
@@ -305,7 +306,7 @@ def test_where_noise_matters_uncut(integrator):
 def test_paths_that_fail_are_counted():
     """Plain DDP's gains on the light finger, in noise they were not made for."""
     problem = noisy_reach("finger", 0.3)
-    plain = dataclasses.replace(vp.solve(problem_without_noise(problem)), problem=problem)
+    plain = dataclasses.replace(vp.solve(noisy_reach("finger")), problem=problem)
     found = plain.monte_carlo(16, 1)
     assert found.failures > 0
     assert found.paths + found.failures == 16
