@@ -114,7 +114,7 @@ def problem(width, dt=0.02):
 
 
 def test_problems_take_an_integrator_that_friction_is_not_too_fast_for():
-    assert problem(0.1).integrator == vp.Gauss(4)
+    assert problem(0.1).integrator == vp.Gauss(3)
     rough = problem(1e-4)
     assert rough.dt * rate_at_rest(rough.scene, rough.q0) > 10.0
     assert rough.integrator == vp.Radau(4)

@@ -1,6 +1,7 @@
 """S-DDP against a plain Riccati recursion, scipy, differences of the rolled-out cost, and brute force."""
 
 import re
+import tracemalloc
 from itertools import pairwise
 
 import numpy as np
@@ -628,6 +629,19 @@ def test_the_same_problem_otherwise():
     rows = vp.TrackingCost(np.zeros((21, 2)))
     with refused(vp.InputError, "(41, 2)"):
         small(rows).at(dt=0.025)
+
+
+@pytest.mark.parametrize("noise", [None, vp.ControlNoise(0.05)], ids=["quiet", "noisy"])
+def test_memory(noise):
+    """It grows with the nodes alone: below 12 kB each at three joints, of the search with all its expansions."""
+    peaks = []
+    for steps in (50, 5000, 20000):
+        problem = arm_problem("finger", vp.Midpoint(), steps=steps, dt=1e-4, noise=noise)
+        tracemalloc.start()
+        vp.solve(problem, max_iterations=1, check=False)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert (peaks[2] - peaks[1]) / 15000 < 12000.0
 
 
 def test_solutions_are_frozen():

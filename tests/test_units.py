@@ -11,7 +11,6 @@ from refusals import refused
 
 import varpin as vp
 from varpin.model import joint_unit
-from varpin.study.advice import Choice, _reason
 
 
 @pytest.fixture
@@ -51,9 +50,3 @@ def test_trajectories_of_another_scene():
     with refused(vp.InputError, "rad/s. Give the scene") as info:
         vp.linearize(vp.Scene(chain, gravity=[0.0, 0.0, -1.6]), motion)
     assert "m/s" not in str(info.value)
-
-
-@pytest.mark.parametrize(("seconds", "words"), [(1.004, ", as long"), (1.4, ", 1.4 times as long")])
-def test_times_of_other_choices(seconds, words):
-    one, other = (Choice(vp.Gauss(2), 0.01, 100, 1e-6, each, True) for each in (1.0, seconds))
-    assert _reason([one, other], True, 1e-5, None, 1.0).splitlines()[1].endswith(words)

@@ -208,9 +208,9 @@ class OptimalControlProblem(Frozen):
             what = "linear controls" if linear else "positions of a KinematicInput"
             raise InputError(f"{what} are decided at every node: leave hold = {hold} out", "hold")
         if sampling != "gauss" and (linear or cubic):
-            what = "linear controls" if linear else "a cubic KinematicInput"
+            what = "linear controls" if linear else "cubic KinematicInputs"
             raise InputError(
-                f"the rule {sampling!r} does not see what {what} do at the nodes: leave it out", "sampling"
+                f"sampling = {sampling!r} misses the nodes, where {what} act: leave it out, for 'gauss'", "sampling"
             )
         t0, (places, rule) = finite("t0", t0), _rule(sampling, dt, cubic=cubic)
         times = t0 + _times(places, steps, dt)

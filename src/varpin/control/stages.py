@@ -99,7 +99,7 @@ class Recursion(NamedTuple):
 class Steps:
     """The steps of a motion; each expansion is made when it is first needed.
 
-    The variables of a step are (x, u), or (x, w, u) with the controls w and u at its ends where they are linear.
+    The variables of a step are (x, u), or (x, w, u) with the controls w and u at its ends where they are linear, (O4).
 
     Raises:
         CostError: An expansion of the running cost is not finite; as the attributes are made.
@@ -301,7 +301,7 @@ class Steps:
 
     @cached_property
     def stake(self) -> Stake:
-        """The cost at stake along the motion."""
+        """The cost at stake along the motion, (O9)."""
         start = np.concatenate([self.problem.q0, self.problem.v0])
         free = moved = 0.0
         for factor, expansion, z in self._models:
