@@ -208,9 +208,9 @@ class OptimalControlProblem(Frozen):
             what = "linear controls" if linear else "positions of a KinematicInput"
             raise InputError(f"{what} are decided at every node: leave hold = {hold} out", "hold")
         if sampling != "gauss" and (linear or cubic):
-            what = "linear controls" if linear else "cubic KinematicInputs"
+            what = "linear controls act" if linear else "a cubic KinematicInput acts"
             raise InputError(
-                f"sampling = {sampling!r} misses the nodes, where {what} act: leave it out, for 'gauss'", "sampling"
+                f"sampling = {sampling!r} misses the nodes, where {what}: leave it out, for 'gauss'", "sampling"
             )
         t0, (places, rule) = finite("t0", t0), _rule(sampling, dt, cubic=cubic)
         times = t0 + _times(places, steps, dt)
