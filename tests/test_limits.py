@@ -255,3 +255,19 @@ def test_chains_come_to_rest_on_springs_and_dampers():
         )
         motion = vp.simulate(scene, np.zeros(n), np.zeros(n), dt=5e-3, steps=4000, check=False)
         assert motion.statistics.substeps[3000:].max() == 1
+
+
+@pytest.mark.parametrize(("end", "words"), [(0.5, "its JointStop gives way"), (0.9, "nothing stops it there")])
+def test_a_passed_limit_is_that_of_the_robot(end, words):
+    """Also beside a stop, which gives way by its width: the depth is counted from the description's limit."""
+    model = pin.Model()
+    model.addJoint(0, pin.JointModelRY(), pin.SE3.Identity(), "swing")
+    model.appendBodyToJoint(1, rod(), pin.SE3.Identity())
+    model.lowerPositionLimit[:], model.upperPositionLimit[:] = -2.0, 0.5
+    scene = vp.Scene(vp.load_robot(model), gravity=False, forces=vp.JointStop(20.0, 1.0, lower=-2.0, upper=end))
+    motion = vp.simulate(scene, [0.0], [2.0], dt=1e-3, steps=1000)
+    (told,) = [finding for finding in motion.warnings if "position limit" in finding]
+    depth = motion.q.max() - 0.5
+    assert f"limit 0.5 rad by {depth:.3g} at" in told
+    assert words in told
+    assert told.value == pytest.approx(depth, rel=1e-12)

@@ -59,17 +59,21 @@ def _passed(
     joint = int(worst.argmax())
     name, peak = scene.robot.joint_names[joint], int(excess[:, joint].argmax())
     unit = _UNITS[kind][int(scene.robot.slides[joint])]
-    limit = limits[int(values[peak, joint] > 0.5 * (limits[0][joint] + limits[1][joint]))][joint]
-    limit = abs(limit) if kind else limit
+    upper = int(values[peak, joint] > 0.5 * (limits[0][joint] + limits[1][joint]))
+    # Stops widen the bounds of positions: the limit is the robot's own.
+    own = limits if kind else scene.robot.position_limits
+    limit = float(abs(own[upper][joint]) if kind else own[upper][joint])
+    by = worst[joint] + abs(own[upper][joint] - limits[upper][joint])
     what = ("position", "velocity", "effort")[kind]
-    stopped = kind == 0 and any(stop.coordinate == joint for stop in of_kind(scene.elements, "JointStop"))
+    stops = [stop.values for stop in of_kind(scene.elements, "JointStop") if stop.coordinate == joint]
+    stopped = kind == 0 and any((2 * upper - 1) * (stop[upper] - limit) < stop[-1] for stop in stops)
     soft = " (its JointStop gives way)" if stopped else "; nothing stops it there" if kind == 0 else ""
     when = f"at t = {trajectory.t[peak]:.3g} s"
     text = (
-        f"joint {name!r} passes its {what} limit {limit:.4g} {unit} by {worst[joint]:.3g} {when}{soft}"
+        f"joint {name!r} passes its {what} limit {limit:.4g} {unit} by {by:.3g} {when}{soft}"
         f"{and_more(int((worst > 0).sum()) - 1, 'joint')}"
     )
-    return Finding(KINDS[kind], text, name, time=float(trajectory.t[peak]), value=float(worst[joint]), unit=unit)
+    return Finding(KINDS[kind], text, name, time=float(trajectory.t[peak]), value=float(by), unit=unit)
 
 
 def _efforts(scene: Scene, trajectory: Trajectory, extremes: Floats | None) -> Floats:
