@@ -73,18 +73,15 @@ def made_up(inertia, control, running, terminal, *, steps=20, h=1e-2):
 def passes(A, B, gradient, hessian, end_gradient, end_hessian, h):
     """(failed, gains, feed-forward, loss) of the compiled recursion and of the one on square roots."""
     N, x, m = B.shape
-    rule = np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
     nothing = np.zeros((N, x, 0))
     steps = core.ExpandedSteps(
-        A=A, B=B, G=nothing, Gx=np.zeros((N, x, 0, x)), Gu=np.zeros((N, x, 0, m)), rule=rule,
-        gradient=gradient, hessian=hessian, velocity=np.zeros((0, x // 2, x)), curvature=np.zeros((0, x + m, x + m)),
-        rate=np.zeros((0, m, m)), pull=np.zeros((0, m)),
+        A=A, B=B, G=nothing, Gx=np.zeros((N, x, 0, x)), Gu=np.zeros((N, x, 0, m)),
+        gradient=gradient, hessian=hessian,
     )  # fmt: skip
     for roots in (False, True):
         feedforward, feedback = np.zeros((N, m)), np.zeros((N, m, x))
         gains = core.Gains(
-            feedforward=feedforward, feedback=feedback, previous=np.zeros((0, m, m)), control_gradient=np.zeros((N, m)),
-            costate=np.zeros((0, x)), spread=np.zeros((0, x, x)),
+            feedforward=feedforward, feedback=feedback, control_gradient=np.zeros((N, m)), spread=np.zeros((0, x, x)),
         )  # fmt: skip
         if roots:
             run = core.RootPass(m, squares_of(end_gradient[None], end_hessian[None]).core, end_gradient)

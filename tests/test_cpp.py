@@ -140,21 +140,14 @@ def planned():
             G=np.zeros((N, 2 * n, 0)),
             Gx=np.zeros((N, 2 * n, 0, 2 * n)),
             Gu=np.zeros((N, 2 * n, 0, m)),
-            rule=np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]]),
             gradient=gradient,
             hessian=hessian[None],
-            velocity=np.zeros((0, n, 2 * n)),
-            curvature=np.zeros((0, 2 * n + m, 2 * n + m)),
-            rate=np.zeros((0, m, m)),
-            pull=np.zeros((0, m)),
         )
         k, K = np.empty((N, m)), np.empty((N, m, 2 * n))
         gains = core.Gains(
             feedforward=k,
             feedback=K,
-            previous=np.zeros((0, m, m)),
             control_gradient=np.empty((N, m)),
-            costate=np.zeros((0, 2 * n)),
             spread=np.zeros((0, 2 * n, 2 * n)),
         )
         hessian = np.diag([at_goal] * n + [at_rest] * n)

@@ -147,7 +147,6 @@ bool backward(const Motion& motion, const Vector& u0, Vector& k, Vector& K) {
                                       .controls = m,
                                       .A = A.data(),
                                       .B = B.data(),
-                                      .rule = {{.q = {.q0 = 1.0}, .v = {.v0 = 1.0}}},
                                       .gradient = gradient.data(),
                                       .hessian = hessian.data(),
                                       .one_hessian = true};

@@ -158,7 +158,6 @@ bool allocates_nothing(const varpin::Mechanism& mechanism) {
                                       .controls = n,
                                       .A = A.data(),
                                       .B = B.data(),
-                                      .rule = {{.q = {.q0 = 1.0}, .v = {.v0 = 1.0}}},
                                       .gradient = gradient.data(),
                                       .hessian = hessian.data(),
                                       .one_hessian = true};

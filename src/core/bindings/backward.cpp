@@ -2,10 +2,8 @@
 #include "varpin/backward.hpp"
 
 #include <nanobind/stl/optional.h>
-#include <nanobind/stl/tuple.h>
 
 #include <optional>
-#include <tuple>
 
 #include "arrays.hpp"
 #include "registrations.hpp"
@@ -18,17 +16,6 @@ namespace {
 
 using namespace nanobind::literals;
 
-std::vector<Sample> rule_of(In<2> rule) {
-    require(rule, "rule", {rule.shape(0), 9});
-    std::vector<Sample> samples;
-    for (std::size_t k = 0; k < rule.shape(0); ++k) {
-        samples.push_back({rule(k, 0),
-                           {rule(k, 1), rule(k, 2), rule(k, 3), rule(k, 4)},
-                           {rule(k, 5), rule(k, 6), rule(k, 7), rule(k, 8)}});
-    }
-    return samples;
-}
-
 // The number of decisions of N steps, with each control held over `hold` of them.
 std::size_t decisions_of(std::size_t N, int hold) {
     if (hold < 1 || N % static_cast<std::size_t>(hold) != 0)
@@ -36,35 +23,20 @@ std::size_t decisions_of(std::size_t N, int hold) {
     return N / static_cast<std::size_t>(hold);
 }
 
-// Steps with references to their arrays; optional arrays may be empty.
+// Steps with references to their arrays.
 struct HeldSteps {
-    HeldSteps(In<3> A_, In<3> B_, In<3> G_, In<4> Gx_, In<4> Gu_, In<2> rule, In<2> gradient_, In<3> hessian_,
-              In<3> velocity_, In<3> curvature_, In<3> rate_, In<2> pull_, std::optional<In<3>> within_,
-              std::optional<Flags<2>> held_)
-        : A(A_),
-          B(B_),
-          G(G_),
-          Gx(Gx_),
-          Gu(Gu_),
-          gradient(gradient_),
-          hessian(hessian_),
-          velocity(velocity_),
-          curvature(curvature_),
-          rate(rate_),
-          pull(pull_),
-          within(within_),
-          held(held_) {
+    HeldSteps(In<3> A_, In<3> B_, In<3> G_, In<4> Gx_, In<4> Gu_, In<2> gradient_, In<3> hessian_)
+        : A(A_), B(B_), G(G_), Gx(Gx_), Gu(Gu_), gradient(gradient_), hessian(hessian_) {
         const std::size_t N = A.shape(0), x = A.shape(1), m = B.shape(2), k = G.shape(2), size = x + m;
-        const std::size_t points = N * rule.shape(0), rated = rate.shape(0);
         if (x % 2 != 0) throw std::invalid_argument("A has an odd number of states");
         require(A, "A", {N, x, x});
         require(B, "B", {N, x, m});
         require(G, "G", {N, x, k});
         require(Gx, "Gx", {N, x, k, x});
         require(Gu, "Gu", {N, x, k, m});
-        require(gradient, "gradient", {points, size});
+        require(gradient, "gradient", {N, size});
         const bool one_hessian = hessian.shape(0) == 1;
-        require(hessian, "hessian", {one_hessian ? 1 : points, size, size});
+        require(hessian, "hessian", {one_hessian ? 1 : N, size, size});
         steps = {.steps = static_cast<std::ptrdiff_t>(N),
                  .dof = static_cast<int>(x / 2),
                  .controls = static_cast<int>(m),
@@ -74,39 +46,25 @@ struct HeldSteps {
                  .G = G.data(),
                  .Gx = Gx.data(),
                  .Gu = Gu.data(),
-                 .rule = rule_of(rule),
                  .gradient = gradient.data(),
                  .hessian = hessian.data(),
-                 .one_hessian = one_hessian,
-                 .velocity = given(velocity, "velocity", {N + 1, x / 2, x}) ? velocity.data() : nullptr,
-                 .curvature = given(curvature, "curvature", {N, size, size}) ? curvature.data() : nullptr,
-                 .within = within && given(*within, "within", {N, x, x}) ? within->data() : nullptr,
-                 .held = held ? held->data() : nullptr,
-                 .rate = rated > 0 && given(rate, "rate", {rated, m, m}) ? rate.data() : nullptr,
-                 .pull = rated > 0 ? pull.data() : nullptr};
-        require(pull, "pull", {rated, m});
+                 .one_hessian = one_hessian};
     }
 
     In<3> A, B, G;
     In<4> Gx, Gu;
     In<2> gradient;
-    In<3> hessian, velocity, curvature;
-    In<3> rate;
-    In<2> pull;
-    std::optional<In<3>> within;
-    std::optional<Flags<2>> held;
+    In<3> hessian;
     ExpandedSteps steps;
 };
 
-// Arrays of gains to be filled in; unwanted ones are empty.
+// Arrays of gains to be filled in.
 struct HeldGains {
-    HeldGains(InOut<2> feedforward_, InOut<3> feedback_, InOut<3> previous_, InOut<2> control_gradient_,
-              InOut<2> costate_, InOut<3> spread_, std::optional<InOut<3>> factors_)
+    HeldGains(InOut<2> feedforward_, InOut<3> feedback_, InOut<2> control_gradient_, InOut<3> spread_,
+              std::optional<InOut<3>> factors_)
         : feedforward(feedforward_),
           feedback(feedback_),
-          previous(previous_),
           control_gradient(control_gradient_),
-          costate(costate_),
           spread(spread_),
           factors(factors_) {}
 
@@ -115,24 +73,20 @@ struct HeldGains {
         const ExpandedSteps& steps = held.steps;
         const auto N = static_cast<std::size_t>(steps.steps), R = decisions_of(N, hold);
         const auto x = static_cast<std::size_t>(steps.states()), m = static_cast<std::size_t>(steps.controls);
-        if (held.held) require(*held.held, "held", {R, m});
-        if (given(held.rate, "rate", {R, m, m})) require(previous, "previous", {R, m, m});
         if (steps.processes > 0) require(spread, "spread", {N, x, x});
         require(feedforward, "feedforward", {R, m});
         require(feedback, "feedback", {R, m, x});
         require(control_gradient, "control_gradient", {R, m});
         return {.feedforward = feedforward.data(),
                 .feedback = feedback.data(),
-                .previous = previous.data(),
                 .control_gradient = control_gradient.data(),
-                .costate = given(costate, "costate", {N, x}) ? costate.data() : nullptr,
                 .spread = spread.data(),
                 .factors = factors && given(*factors, "factors", {R, m, m}) ? factors->data() : nullptr};
     }
 
     InOut<2> feedforward;
-    InOut<3> feedback, previous;
-    InOut<2> control_gradient, costate;
+    InOut<3> feedback;
+    InOut<2> control_gradient;
     InOut<3> spread;
     std::optional<InOut<3>> factors;
 };
@@ -185,25 +139,17 @@ std::ptrdiff_t run(BackwardPass& pass, double h, int hold, double regularization
 }
 
 std::ptrdiff_t run_on_roots(RootPass& pass, double h, int hold, double regularization, const HeldSteps& given,
-                            const HeldGains& held, const HeldSquares& running, const HeldSquares* change,
-                            const HeldSquares* within) {
+                            const HeldGains& held, const HeldSquares& running) {
     require_same(pass, given);
     const Gains gains = held.fitting(given, hold);
-    const ExpandedSteps& steps = given.steps;
-    if (steps.rate && !change) throw std::invalid_argument("where a control's change costs, change is needed");
-    const Squares samples = running.fitting("running", given.gradient.shape(0), given.gradient.shape(1));
-    const Squares changes =
-        steps.rate ? change->fitting("change", given.rate.shape(0), given.rate.shape(1)) : Squares{};
-    if (steps.within && !within) throw std::invalid_argument("where jumps have further costs, within is needed");
-    const auto N = static_cast<std::size_t>(steps.steps), x = static_cast<std::size_t>(steps.states());
-    const Squares jumps = steps.within ? within->fitting("within", N, x) : Squares{};
+    const Squares costs = running.fitting("running", given.gradient.shape(0), given.gradient.shape(1));
     nb::gil_scoped_release release;
-    return pass.run(h, hold, regularization, steps, samples, changes, jumps, gains);
+    return pass.run(h, hold, regularization, given.steps, costs, gains);
 }
 
 // The linearized motion under a plan from `state`, overwritten by that at the end: expected (R, 2n + m), moves (R, m).
 // True where a control reaches a limit.
-bool foresee(int hold, In<3> A, In<3> B, In<2> feedforward, In<3> feedback, In<3> previous, In<3> slack, InOut<1> state,
+bool foresee(int hold, In<3> A, In<3> B, In<2> feedforward, In<3> feedback, In<3> slack, InOut<1> state,
              InOut<2> expected, InOut<2> moves, std::optional<InOut<2>> after) {
     const std::size_t N = A.shape(0), x = A.shape(1), m = B.shape(2), size = x + m;
     const std::size_t R = decisions_of(N, hold);
@@ -223,7 +169,6 @@ bool foresee(int hold, In<3> A, In<3> B, In<2> feedforward, In<3> feedback, In<3
                               .B = B.data(),
                               .feedforward = feedforward.data(),
                               .feedback = feedback.data(),
-                              .previous = given(previous, "previous", {R, m, m}) ? previous.data() : nullptr,
                               .slack = given(slack, "slack", {R, 2, m}) ? slack.data() : nullptr};
     nb::gil_scoped_release release;
     return predict(plan, state.data(), expected.data(), moves.data(), after ? after->data() : nullptr);
@@ -241,15 +186,12 @@ void define_results(nb::class_<Pass>& type) {
 
 void register_backward(nb::module_& m) {
     nb::class_<HeldSteps>(m, "ExpandedSteps")
-        .def(nb::init<In<3>, In<3>, In<3>, In<4>, In<4>, In<2>, In<2>, In<3>, In<3>, In<3>, In<3>, In<2>,
-                      std::optional<In<3>>, std::optional<Flags<2>>>(),
-             nb::kw_only(), "A"_a, "B"_a, "G"_a, "Gx"_a, "Gu"_a, "rule"_a, "gradient"_a, "hessian"_a, "velocity"_a,
-             "curvature"_a, "rate"_a, "pull"_a, "within"_a.none() = nb::none(), "held"_a.none() = nb::none());
+        .def(nb::init<In<3>, In<3>, In<3>, In<4>, In<4>, In<2>, In<3>>(), nb::kw_only(), "A"_a, "B"_a, "G"_a, "Gx"_a,
+             "Gu"_a, "gradient"_a, "hessian"_a);
     nb::class_<HeldGains>(m, "Gains")
-        .def(nb::init<InOut<2>, InOut<3>, InOut<3>, InOut<2>, InOut<2>, InOut<3>, std::optional<InOut<3>>>(),
-             nb::kw_only(), "feedforward"_a.noconvert(), "feedback"_a.noconvert(), "previous"_a.noconvert(),
-             "control_gradient"_a.noconvert(), "costate"_a.noconvert(), "spread"_a.noconvert(),
-             "factors"_a.noconvert().none() = nb::none());
+        .def(nb::init<InOut<2>, InOut<3>, InOut<2>, InOut<3>, std::optional<InOut<3>>>(), nb::kw_only(),
+             "feedforward"_a.noconvert(), "feedback"_a.noconvert(), "control_gradient"_a.noconvert(),
+             "spread"_a.noconvert(), "factors"_a.noconvert().none() = nb::none());
     nb::class_<HeldSquares>(m, "Squares").def(nb::init<In<3>, In<2>, In<2>>(), "root"_a, "shift"_a, "linear"_a);
     auto pass = nb::class_<BackwardPass>(m, "BackwardPass");
     pass.def("__init__", &make_pass, "controls"_a, "gradient"_a, "hessian"_a)
@@ -257,12 +199,10 @@ void register_backward(nb::module_& m) {
     define_results(pass);
     auto root_pass = nb::class_<RootPass>(m, "RootPass");
     root_pass.def("__init__", &make_root_pass, "controls"_a, "terminal"_a, "gradient"_a)
-        .def("run", &run_on_roots, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a, "running"_a,
-             "change"_a.none() = nb::none(), "within"_a.none() = nb::none());
+        .def("run", &run_on_roots, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a, "running"_a);
     define_results(root_pass);
-    m.def("foresee", &foresee, "hold"_a, "A"_a, "B"_a, "feedforward"_a, "feedback"_a, "previous"_a, "slack"_a,
-          "state"_a.noconvert(), "expected"_a.noconvert(), "moves"_a.noconvert(),
-          "after"_a.noconvert().none() = nb::none());
+    m.def("foresee", &foresee, "hold"_a, "A"_a, "B"_a, "feedforward"_a, "feedback"_a, "slack"_a, "state"_a.noconvert(),
+          "expected"_a.noconvert(), "moves"_a.noconvert(), "after"_a.noconvert().none() = nb::none());
 }
 
 }  // namespace varpin::border

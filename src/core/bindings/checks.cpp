@@ -1,10 +1,8 @@
 // Checks of a finished motion.
 #include "varpin/checks.hpp"
 
-#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
-#include <optional>
 #include <tuple>
 #include <utility>
 
@@ -94,20 +92,9 @@ std::tuple<bool, bool, bool> inside_bounds(const Mechanism& mechanism, In<2> q, 
     return {found.position, found.velocity, found.effort};
 }
 
-std::tuple<std::int64_t, std::int64_t, std::int64_t> alternation(In<2> v, std::optional<In<2>> u, double counts,
-                                                                 double idle, double even) {
-    if (v.shape(0) == 0) throw std::invalid_argument("a motion needs at least one node");
-    if (u && u->shape(0) != v.shape(0) - 1) throw std::invalid_argument("each step needs one control");
-    const Alternation found =
-        longest_alternation(v.data(), static_cast<std::int64_t>(v.shape(0)) - 1, static_cast<int>(v.shape(1)),
-                            u ? u->data() : nullptr, u ? static_cast<int>(u->shape(1)) : 0, {counts, idle, even});
-    return {found.joint, found.changes, found.first};
-}
-
 }  // namespace
 
 void register_checks(nb::module_& m) {
-    m.def("longest_alternation", &alternation, "v"_a, "u"_a.none(), nb::kw_only(), "counts"_a, "idle"_a, "even"_a);
     m.def("fastest_damping", &fastest_damping_at, "mechanism"_a, "q"_a, "v"_a, "f"_a, "least"_a);
     m.def("pulls_fast", &pulls_fast_at, "mechanism"_a, "q"_a, "v"_a, "f"_a, "dt"_a);
     nb::class_<Stretch>(m, "Stretch").def_static("make", &stretch_of, nb::kw_only(), "curves"_a, "sums"_a, "places"_a);

@@ -25,9 +25,6 @@ from varpin.trajectory import Trajectory
 TRUSTED = 1e-9
 # Size of eigenvalues that are rounding errors in a Hessian with unit diagonal.
 _ROUNDING = 1e-12
-# The sampling rule of a cost in z at the beginning of the step.
-_RULE: Floats = np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
-_RULE.setflags(write=False)
 
 
 class Plan(NamedTuple):
@@ -111,20 +108,13 @@ def _pass(steps: Steps, given: Recursion, regularization: float, *, second: bool
             G=given.G,
             Gx=np.ascontiguousarray(given.Gz[..., :X]),
             Gu=np.ascontiguousarray(given.Gz[..., X:]),
-            rule=_RULE,
             gradient=given.gradient,
             hessian=given.hessian,
-            velocity=np.zeros((0, X // 2, X)),
-            curvature=np.zeros((0, Z, Z)),
-            rate=np.zeros((0, m, m)),
-            pull=np.zeros((0, m)),
         ),
         core.Gains(
             feedforward=feedforward,
             feedback=gains,
-            previous=np.empty((0, m, m)),
             control_gradient=by_controls,
-            costate=np.empty((0, X)),
             spread=spread,
             factors=factors,
         ),
@@ -151,7 +141,7 @@ def foreseen(steps: Steps, plan: Plan) -> tuple[Floats, bool]:
     A, B = (np.ascontiguousarray(part) for part in (given.J[:, :, :X], given.J[:, :, X:]))
     slack = steps.slack if problem.limited else np.zeros((0, 2, m))
     expected, moves, after = np.empty((R, Z)), np.empty((R, m)), np.empty((S, X))
-    fixed = plan.feedforward, plan.gains, np.zeros((0, m, m)), slack
+    fixed = plan.feedforward, plan.gains, slack
     limited = core.foresee(problem.hold, A, B, *fixed, np.zeros(Z), expected, moves, after)
     x = np.vstack([np.zeros((1, layout.states)), after[:, : layout.states]])
     return layout.joined(x[-layout.stages - 1 :], moves), limited

@@ -29,7 +29,6 @@ from varpin.core._core import foresee as foresee
 from varpin.core._core import inside_bounds as inside_bounds
 from varpin.core._core import inverse_dynamics as inverse_dynamics
 from varpin.core._core import linearize_explicit as linearize_explicit
-from varpin.core._core import longest_alternation as longest_alternation
 from varpin.core._core import propagated_errors as propagated_errors
 from varpin.core._core import pulls_fast as pulls_fast
 from varpin.core._core import sample_steps as sample_steps

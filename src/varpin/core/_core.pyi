@@ -206,7 +206,7 @@ def constrained_derivatives(
     """
 
 class ExpandedSteps:
-    """The linearized dynamics and the expanded costs of N steps; optional arrays may be empty.
+    """The linearized dynamics and the expanded costs of N steps.
 
     The fields are described in src/core/include/varpin/steps.hpp.
     """
@@ -219,25 +219,16 @@ class ExpandedSteps:
         G: Floats,
         Gx: Floats,
         Gu: Floats,
-        rule: Floats,
         gradient: Floats,
         hessian: Floats,
-        velocity: Floats,
-        curvature: Floats,
-        rate: Floats,
-        pull: Floats,
-        within: Floats | None = None,
-        held: NDArray[np.bool_] | None = None,
     ) -> None:
         """Raises ValueError for arrays that do not fit each other."""
 
 class Gains:
     """Arrays of R decisions and N steps that a backward pass fills in, for u + k + K (x - x_nominal).
 
-    ``feedforward`` (R, m), ``feedback`` (R, m, 2n), ``previous`` (R, m, m) on the previous control if its change has a
-    cost, ``control_gradient`` (R, m) of the cost, ``costate`` (N, 2n), its gradient in the state after each step, empty
-    if not wanted, and ``spread`` (N, 2n, 2n), S, with noise only. On request ``factors`` (R, m, m), L D L' of the
-    regularized Quu.
+    ``feedforward`` (R, m), ``feedback`` (R, m, 2n), ``control_gradient`` (R, m) of the cost, and with noise
+    ``spread`` (N, 2n, 2n), S. On request ``factors`` (R, m, m), L D L' of the regularized Quu.
     """
 
     def __init__(
@@ -245,9 +236,7 @@ class Gains:
         *,
         feedforward: Floats,
         feedback: Floats,
-        previous: Floats,
         control_gradient: Floats,
-        costate: Floats,
         spread: Floats,
         factors: Floats | None = None,
     ) -> None: ...
@@ -293,13 +282,8 @@ class RootPass(_Found):
         steps: ExpandedSteps,
         gains: Gains,
         running: Squares,
-        change: Squares | None = None,
-        within: Squares | None = None,
     ) -> int:
-        """See :class:`BackwardPass`; ``running`` has the costs of the samples, ``change`` those of R changes.
-
-        ``within`` has those of the noise's jumps where the steps have them.
-        """
+        """See :class:`BackwardPass`; ``running`` has the costs of the steps."""
 
 def foresee(
     hold: int,
@@ -307,7 +291,6 @@ def foresee(
     B: Floats,
     feedforward: Floats,
     feedback: Floats,
-    previous: Floats,
     slack: Floats,
     state: Floats,
     expected: Floats,
@@ -316,9 +299,8 @@ def foresee(
 ) -> bool:
     """The deviations on N linearized steps under a plan of R decisions.
 
-    Its steps are ``A`` (N, 2n, 2n) and ``B`` (N, 2n, m), its controls change by ``feedforward`` (R, m), ``feedback``
-    (R, m, 2n) of the state, and ``previous`` (R, m, m) of the previous control unless it is empty, clipped to ``slack``
-    (R, 2, m) unless it is empty.
+    Its steps are ``A`` (N, 2n, 2n) and ``B`` (N, 2n, m), its controls change by ``feedforward`` (R, m) and
+    ``feedback`` (R, m, 2n) of the state, clipped to ``slack`` (R, 2, m) unless it is empty.
 
     ``state`` (2n + m,) has the deviations of the state and of the previous control at the start, and is overwritten by
     those at the end. ``expected`` (R, 2n + m) receives those before each decision, ``moves`` (R, m) the changes of the
@@ -485,15 +467,6 @@ def inside_bounds(
     """Whether q and v (N + 1, n) and the controls' forces are each within ``bounds`` (3, 2, n), the least and the most.
 
     The controls are u (N, m), and those at the stages of each step ``within`` (N, s, m).
-    """
-
-def longest_alternation(
-    v: Floats, u: Floats | None, *, counts: float, idle: float, even: float
-) -> tuple[int, int, int]:
-    """Coordinate, length and first node of the longest alternation of v (N + 1, n).
-
-    An alternation is a sequence of sign changes in consecutive second differences. Nodes at which a control of u (N, m)
-    reverses interrupt it.
     """
 
 class Subject(Enum):

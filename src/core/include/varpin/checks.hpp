@@ -1,5 +1,5 @@
-// Checks of a finished motion: rates of the scene that its steps cannot resolve, bounds, velocities that alternate. The
-// caller sets the thresholds. docs/mathematics.md, "The error of a motion".
+// Checks of a finished motion: rates of the scene that its steps cannot resolve, bounds. The caller sets the
+// thresholds. docs/mathematics.md, "The error of a motion".
 #pragma once
 
 #include <algorithm>
@@ -158,60 +158,6 @@ inline Inside inside_of(const Mechanism& mechanism, const Record& record, const 
     for (std::int64_t k = 0; k < record.steps; ++k) push(record.u + k * m);
     for (std::int64_t row = 0; within && row < record.steps * stages; ++row) push(within + row * m);
     return found;
-}
-
-// A sequence of consecutive sign changes in the second differences of a velocity: coordinate, number, first node.
-struct Alternation {
-    std::int64_t joint = 0;
-    std::int64_t changes = 0;
-    std::int64_t first = 0;
-};
-
-// Second differences that count: above `counts` of the joint's largest velocity and above `idle` of that of all joints;
-// consecutive ones differ by less than the factor `even`.
-struct Turns {
-    double counts = 0.0;
-    double idle = 0.0;
-    double even = 0.0;
-};
-
-// The longest sequence over N + 1 nodes of v (N + 1, n). It is interrupted where a control of u (N, m) reverses by more
-// than the share `counts` of its largest value, since the control then explains it; u may be null.
-inline Alternation longest_alternation(const double* v, std::int64_t steps, int n, const double* u, int m,
-                                       const Turns& what) {
-    const auto bend = [&](std::int64_t k, int c) {
-        const double* at = v + k * n + c;
-        return (at[2 * n] - at[n]) - (at[n] - at[0]);
-    };
-    std::vector<double> fastest(n), greatest(u ? m : 0);
-    for (std::int64_t k = 0; k <= steps; ++k) {
-        for (int c = 0; c < n; ++c) fastest[c] = larger(fastest[c], std::abs(v[k * n + c]));
-    }
-    for (std::int64_t k = 0; u && k < steps; ++k) {
-        for (int c = 0; c < m; ++c) greatest[c] = larger(greatest[c], std::abs(u[k * m + c]));
-    }
-    double all = 0.0;
-    for (double speed : fastest) all = larger(all, speed);
-    Alternation longest;
-    std::vector<std::int64_t> row(n);
-    for (std::int64_t k = 0; k + 2 < steps; ++k) {
-        bool driven = false;
-        for (int c = 0; u && c < m; ++c) {
-            const double* at = u + k * m + c;
-            const double before = at[m] - at[0], after = at[2 * m] - at[m];
-            driven = driven || (before * after < 0.0 && std::abs(after) > what.counts * greatest[c]);
-        }
-        for (int c = 0; c < n; ++c) {
-            const double before = bend(k, c), after = bend(k + 1, c);
-            const double small = std::min(std::abs(before), std::abs(after));
-            const double large = std::max(std::abs(before), std::abs(after));
-            const bool turns = !driven && before * after < 0.0 && small > what.counts * fastest[c] &&
-                               small > what.idle * all && large < what.even * small;
-            row[c] = turns ? row[c] + 1 : 0;
-            if (row[c] > longest.changes) longest = {c, row[c], k + 1 - row[c]};
-        }
-    }
-    return longest;
 }
 
 }  // namespace varpin

@@ -223,19 +223,6 @@ inline void add_rows(const double* factor, const TiledMatrix& a, Range range, do
     detail::add_some_rows(factor, a, range, out, columns);
 }
 
-// out = s a + t b over whole tiles of `columns` columns.
-[[gnu::always_inline]] inline void combine_rows(double s, const double* a, double t, const double* b, int columns,
-                                                double* out) {
-    const Quad first{s, s, s, s}, second{t, t, t, t};
-    for (int c = 0; c < columns; c += tile) quad_at(out + c) = first * quad_at(a + c) + second * quad_at(b + c);
-}
-
-// out += s a over whole tiles of `columns` columns.
-[[gnu::always_inline]] inline void add_scaled_row(double s, const double* a, int columns, double* out) {
-    const Quad factor{s, s, s, s};
-    for (int c = 0; c < columns; c += tile) quad_at(out + c) += factor * quad_at(a + c);
-}
-
 // Copy the upper triangle to the lower one, in these rows.
 inline void mirror(TiledMatrix& a, Range rows) {
     const int stride = a.stride();

@@ -11,7 +11,7 @@
 // (Kailath, Sayed and Hassibi, Linear Estimation, 2000, chapter 12). Rounding errors are eps times the root of the
 // largest terms, instead of eps times these terms in the plain recursion, so that weights may differ by twice as many
 // orders of magnitude. Every Hessian must be positive semidefinite; the part of a gradient outside its range is stored
-// separately. With a cost of changes of the control, x includes the previous control.
+// separately.
 // Equation (O3) of docs/mathematics.md.
 #pragma once
 
@@ -91,7 +91,7 @@ class RootPass {
           Qu(m),
           Ruu_k(m),
           forced(m),
-          K(m * size) {
+          K(m * x) {
         root.reset(size + 1);
         for (int i = 0; i < x; ++i) {
             double* row = root.push();
@@ -103,26 +103,20 @@ class RootPass {
         column_norms(root, 0, scale.data(), x);
     }
 
-    // A pass over a block of steps, as BackwardPass::run. `running` has the costs of the samples, `change` the costs of
-    // changes of the control, `within` the further costs of the noise's jumps, if any.
+    // A pass over a block of steps, as BackwardPass::run, with their running costs.
     std::ptrdiff_t run(double h, int hold, double regularization, const ExpandedSteps& steps, const Squares& running,
-                       const Squares& change, const Squares& within, const Gains& gains) {
+                       const Gains& gains) {
         for (std::ptrdiff_t s = steps.steps - 1; s >= 0; --s) {
-            if (gains.costate) std::copy_n(costate.data(), x, gains.costate + s * x);
-            const bool decides = s % hold == 0;
-            stack.reset(decides && steps.rate ? size + m + 1 : size + 1);
-            carry(steps, s, steps.rate || (s + 1) % hold != 0);
-            noise_root.reset(x);
-            if (steps.processes > 0) add_value_to_noise_root(std::sqrt(h));
-            if (steps.processes > 0 && steps.within) add_to_noise_root(std::sqrt(h), within.root_of(s, x));
+            stack.reset(size + 1);
+            carry(steps, s, (s + 1) % hold != 0);
             add_running_cost(h, steps, s, running);
-            if (steps.processes > 0) add_noise(steps, s, gains.spread + s * x * x);
+            if (steps.processes > 0) add_noise(h, steps, s, gains.spread + s * x * x);
             linear.swap(before);
             costate.swap(gradient);
             scale.swap(terms);
-            if (!decides) {
+            if (s % hold != 0) {
                 keep();
-            } else if (!decide(regularization, steps, s / hold, change, gains)) {
+            } else if (!decide(regularization, s / hold, gains)) {
                 return s / hold;
             }
         }
@@ -135,7 +129,7 @@ class RootPass {
     Found found;
 
   private:
-    // Rows of `stack` are in (u, x, previous control if changes have a cost, shift); everything else is in (x, u).
+    // Rows of `stack` are in (u, x, shift); everything else is in (x, u).
     void add_to_row(double factor, const double* from, double* row) const {
         if (factor == 0.0) return;
         for (int c = 0; c < x; ++c) row[m + c] += factor * from[c];
@@ -144,7 +138,7 @@ class RootPass {
     void add_row(double factor, const double* from, std::vector<double>& to) const {
         for (int c = 0; c < size; ++c) to[c] += factor * from[c];
     }
-    double& shift(int i) { return stack[i][stack.width() - 1]; }
+    double& shift(int i) { return stack[i][size]; }
 
     // The value after step s as rows in (x, u); its linear part, its gradient, and the scale of its terms.
     void carry(const ExpandedSteps& steps, std::ptrdiff_t s, bool held) {
@@ -176,55 +170,26 @@ class RootPass {
         }
     }
 
-    // Rows N with S = N'N for a jump of the state: from the value, then from the samples after the jump.
-    void add_value_to_noise_root(double factor) {
+    // Add h l(x, u) of step s.
+    void add_running_cost(double h, const ExpandedSteps& steps, std::ptrdiff_t s, const Squares& running) {
+        const double *L = running.root_of(s, size), factor = std::sqrt(h);
+        for (int i = 0; i < size; ++i) {
+            double* row = stack.push();
+            add_to_row(factor, L + i * size, row);
+            row[size] = factor * running.shift[s * size + i];
+        }
+        add_row(h, running.linear + s * size, before);
+        add_row(h, steps.gradient_at(s), gradient);
+    }
+
+    // Add the terms of the noise, with rows N of S = N'N; writes S into `spread`.
+    void add_noise(double h, const ExpandedSteps& steps, std::ptrdiff_t s, double* spread) {
+        const double factor = std::sqrt(h);
+        noise_root.reset(x);
         for (int i = 0; i < root.rows(); ++i) {
             double* row = noise_root.push();
             for (int c = 0; c < x; ++c) row[c] = factor * root[i][c];
         }
-    }
-
-    void add_to_noise_root(double factor, const double* more) {
-        for (int i = 0; i < x; ++i) {
-            double* row = noise_root.push();
-            for (int c = 0; c < x; ++c) row[c] = factor * more[i * x + c];
-        }
-    }
-
-    void add_running_cost(double h, const ExpandedSteps& steps, std::ptrdiff_t s, const Squares& running) {
-        const auto samples = static_cast<std::ptrdiff_t>(steps.rule.size());
-        for (std::ptrdiff_t sample = 0; sample < samples; ++sample) {
-            const std::ptrdiff_t point = s * samples + sample;
-            const Sample& at = steps.rule[sample];
-            const double weight = h * at.weight, factor = std::sqrt(weight);
-            const double* L = running.root_of(point, size);
-            step.expand(at, x);
-            for (int i = 0; i < size; ++i) {
-                double* row = stack.push();
-                for (int j = 0; j < x; ++j) add_to_row(factor * L[i * size + j], step.D[j], row);
-                for (int c = 0; c < m; ++c) row[c] += factor * L[i * size + x + c];
-                shift(stack.rows() - 1) = factor * running.shift[point * size + i];
-            }
-            expand_gradient(weight, running.linear + point * size, before);
-            expand_gradient(weight, steps.gradient_at(point), gradient);
-            if (steps.processes == 0 || !step.expand_after(at)) continue;
-            for (int i = 0; i < size; ++i) {
-                double* row = noise_root.push();
-                for (int j = 0; j < x; ++j) {
-                    const double entry = h * std::sqrt(at.weight) * L[i * size + j];
-                    for (int c = 0; c < x; ++c) row[c] += entry * step.P[j][c];
-                }
-            }
-        }
-    }
-
-    // Add a gradient in (q, v, u) at the sample to one in (x, u).
-    void expand_gradient(double weight, const double* from, std::vector<double>& to) const {
-        for (int i = 0; i < x; ++i) add_row(weight * from[i], step.D[i], to);
-        for (int c = x; c < size; ++c) to[c] += weight * from[c];
-    }
-
-    void add_noise(const ExpandedSteps& steps, std::ptrdiff_t s, double* spread) {
         noise_root.triangularize(x);
         std::fill_n(spread, x * x, 0.0);
         for (int l = 0; l < x; ++l) {
@@ -262,14 +227,11 @@ class RootPass {
     }
 
     // Gains of decision r, and the value under them; false if there is no minimum.
-    bool decide(double regularization, const ExpandedSteps& steps, std::ptrdiff_t r, const Squares& change,
-                const Gains& gains) {
-        if (steps.rate) add_change(change, steps.pull + r * m, r);
+    bool decide(double regularization, std::ptrdiff_t r, const Gains& gains) {
         column_norms(stack, 0, control_norm.data(), m);
         column_norms(stack, m, terms.data(), x);
-        const int others = stack.width() - 1 - m;  // x, and the previous control
-        stack.triangularize(m + others);
-        if (!std::all_of(stack[0], stack[m + others],
+        stack.triangularize(size);
+        if (!std::all_of(stack[0], stack[size],
                          [](double entry) { return std::abs(entry) < std::numeric_limits<double>::infinity(); }))
             return false;
         const double largest = m > 0 ? *std::max_element(control_norm.begin(), control_norm.end()) : 0.0;
@@ -278,13 +240,12 @@ class RootPass {
             Qu[i] = linear[x + i];
             for (int l = 0; l <= i; ++l) Qu[i] += stack[l][i] * shift(l);
         }
-        const bool regular = regularize(regularization, largest, steps, r);
+        const bool regular = regularize(regularization, largest);
         double* k = gains.feedforward + r * m;
-        if (!note_loss(steps, r)) return false;
-        solve(steps, r, others, k);
+        if (!note_loss()) return false;
+        solve(k);
         for (int i = 0; i < m; ++i) {
-            std::copy_n(&K[i * others], x, gains.feedback + (r * m + i) * x);
-            if (steps.rate) std::copy_n(&K[i * others + x], m, gains.previous + (r * m + i) * m);
+            std::copy_n(&K[i * x], x, gains.feedback + (r * m + i) * x);
             gains.control_gradient[r * m + i] = costate[x + i];
             Ruu_k[i] = 0.0;
             for (int j = i; j < m; ++j) Ruu_k[i] += stack[i][j] * k[j];
@@ -293,36 +254,19 @@ class RootPass {
         }
         if (gains.factors) write_factors(gains.factors + r * m * m);
         // The rest of the controls' rows is zero up to rounding where they are as they were.
-        minimized_value(others, !regular);
-        set_control_before(steps, r, others);
+        minimized_value(!regular);
+        set_linear_before();
         return true;
     }
 
-    // Add the cost of the change of a control, in the control and the previous one.
-    void add_change(const Squares& change, const double* pull, std::ptrdiff_t r) {
-        const double* L = change.root_of(r, m);
-        for (int i = 0; i < m; ++i) {
-            double* row = stack.push();
-            for (int c = 0; c < m; ++c) {
-                row[c] = L[i * m + c];
-                row[m + x + c] = -L[i * m + c];
-            }
-            shift(stack.rows() - 1) = change.shift[r * m + i];
-            costate[x + i] += pull[i];
-        }
-    }
-
-    // Regularize the rows of controls, each in proportion to the norm of its own column, and replace the columns of
-    // controls that are held by rows of their own. A control without any effect is not regularized, if there are
-    // others. True if there is nothing to do.
-    bool regularize(double regularization, double largest, const ExpandedSteps& steps, std::ptrdiff_t r) {
+    // Regularize the rows of controls, each in proportion to the norm of its own column. A control without any effect
+    // is not regularized, if there are others. True if there is nothing to do.
+    bool regularize(double regularization, double largest) {
         bool regular = true;
         firm.reset(stack.width());
         for (int i = 0; i < m; ++i) std::copy_n(stack[i], stack.width(), firm.push());
         for (int i = 0; i < m; ++i) {
-            const bool held = steps.holds(r, i), idle = control_norm[i] == 0.0 && Qu[i] == 0.0;
-            for (int l = 0; held && l < m; ++l) firm[l][i] = 0.0;
-            weight[i] = held || idle ? largest : std::sqrt(regularization) * control_norm[i];
+            weight[i] = is_idle(i) ? largest : std::sqrt(regularization) * control_norm[i];
             regular = regular && weight[i] == 0.0;
         }
         if (regular) return true;
@@ -331,12 +275,15 @@ class RootPass {
         return false;
     }
 
+    // Whether control i has no effect.
+    bool is_idle(int i) const { return control_norm[i] == 0.0 && Qu[i] == 0.0; }
+
     // Add the rounding errors of the firm rows to the loss; false where a control has no minimum.
-    bool note_loss(const ExpandedSteps& steps, std::ptrdiff_t r) {
+    bool note_loss() {
         for (int i = 0; i < m; ++i) {
             const double pivot = std::abs(firm[i][i]);
             if (!(pivot > 0.0)) return false;
-            if (steps.holds(r, i) || (control_norm[i] == 0.0 && Qu[i] == 0.0)) continue;
+            if (is_idle(i)) continue;
             found.loss = std::max(found.loss, epsilon * std::max(scale[x + i], control_norm[i]) / pivot);
         }
         return true;
@@ -350,56 +297,53 @@ class RootPass {
         }
     }
 
-    // k and K (m, others): R_uu (k, K) = -(shift + R_uu'^-1 linear, R_ux) in the firm rows.
-    void solve(const ExpandedSteps& steps, std::ptrdiff_t r, int others, double* k) {
+    // k and K: R_uu (k, K) = -(shift + R_uu'^-1 linear, R_ux) in the firm rows.
+    void solve(double* k) {
         for (int i = 0; i < m; ++i) {
-            double total = steps.holds(r, i) ? 0.0 : linear[x + i];
+            double total = linear[x + i];
             for (int j = 0; j < i; ++j) total -= firm[j][i] * forced[j];
             forced[i] = total / firm[i][i];
         }
         for (int i = m - 1; i >= 0; --i) {
             const double* row = firm[i];
-            double* __restrict gains = &K[i * others];
-            double total = -row[m + others] - forced[i];
-            for (int c = 0; c < others; ++c) gains[c] = -row[m + c];
+            double* __restrict gains = &K[i * x];
+            double total = -row[size] - forced[i];
+            for (int c = 0; c < x; ++c) gains[c] = -row[m + c];
             for (int j = i + 1; j < m; ++j) {
-                const double* __restrict other = &K[j * others];
+                const double* __restrict other = &K[j * x];
                 total -= row[j] * k[j];
-                for (int c = 0; c < others; ++c) gains[c] -= row[j] * other[c];
+                for (int c = 0; c < x; ++c) gains[c] -= row[j] * other[c];
             }
             k[i] = total / row[i];
-            for (int c = 0; c < others; ++c) gains[c] /= row[i];
+            for (int c = 0; c < x; ++c) gains[c] /= row[i];
         }
     }
 
     // The value before a decision: the rows without controls, and the rest of the others if `left`.
-    void minimized_value(int others, bool left) {
+    void minimized_value(bool left) {
         root.reset(size + 1);
-        for (int i = left ? 0 : m; i < m + others; ++i) {
+        for (int i = left ? 0 : m; i < size; ++i) {
             double* row = root.push();
-            std::copy_n(stack[i] + m, others, row);
+            std::copy_n(stack[i] + m, x, row);
             row[size] = shift(i);
             if (i >= m) continue;
             for (int j = i; j < m; ++j) {
-                for (int c = 0; c < others; ++c) row[c] += stack[i][j] * K[j * others + c];
+                for (int c = 0; c < x; ++c) row[c] += stack[i][j] * K[j * x + c];
             }
             row[size] += Ruu_k[i];
         }
         std::copy_n(terms.begin(), x, scale.begin());
     }
 
-    // The linear parts of the value before decision r; those in u become those in the previous control.
-    void set_control_before(const ExpandedSteps& steps, std::ptrdiff_t r, int others) {
+    // The linear part of the value before a decision; nothing depends on u there.
+    void set_linear_before() {
         std::fill_n(before.begin(), size, 0.0);
         std::copy_n(linear.begin(), x, before.begin());
         for (int i = 0; i < m; ++i) {
-            for (int c = 0; c < others; ++c) before[c] += K[i * others + c] * linear[x + i];
+            for (int c = 0; c < x; ++c) before[c] += K[i * x + c] * linear[x + i];
         }
         linear.swap(before);
-        for (int c = 0; c < m; ++c) {
-            costate[x + c] = steps.rate ? -steps.pull[r * m + c] : 0.0;
-            scale[x + c] = steps.rate ? std::sqrt(steps.rate[(r * m + c) * m + c]) : 0.0;
-        }
+        for (int c = x; c < size; ++c) costate[c] = scale[c] = 0.0;
     }
 
     static void column_norms(const RowStack& rows, int first, double* norms, int count) {
@@ -421,7 +365,7 @@ class RootPass {
 
     // Work arrays of a step.
     LinearStep step;
-    RowStack stack;                // rows of the cost in (u, x, ...)
+    RowStack stack;                // rows of the cost in (u, x)
     RowStack noise_root;           // (., x) N
     std::vector<double> before;    // (size) the next `linear`
     std::vector<double> gradient;  // (size) the next costate
@@ -430,7 +374,7 @@ class RootPass {
     RowStack firm;                             // regularized rows of the controls
     std::vector<double> control_norm, weight;  // (m) norms of the controls' columns; regularization
     std::vector<double> Qu;                    // gradient
-    std::vector<double> Ruu_k, forced, K;      // R_uu k; firm'^-1 linear; (m, others)
+    std::vector<double> Ruu_k, forced, K;      // R_uu k; firm'^-1 linear; (m, x)
 };
 
 }  // namespace varpin

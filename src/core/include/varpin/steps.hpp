@@ -8,16 +8,6 @@
 
 namespace varpin {
 
-// A sample of the running cost in a step. Its q and v are linear combinations of those at the nodes before (0) and
-// after (1) the step.
-struct Sample {
-    struct Sum {
-        double q0 = 0.0, v0 = 0.0, q1 = 0.0, v1 = 0.0;
-    };
-    double weight = 1.0;
-    Sum q, v;
-};
-
 // The linearized dynamics and the expanded costs.
 struct ExpandedSteps {
     std::ptrdiff_t steps = 0;  // N
@@ -29,34 +19,21 @@ struct ExpandedSteps {
     const double* G = nullptr;         // (N, 2n, k) change of x per unit of each process
     const double* Gx = nullptr;        // (N, 2n, k, 2n)
     const double* Gu = nullptr;        // (N, 2n, k, m)
-    std::vector<Sample> rule;          // s in each step
-    const double* gradient = nullptr;  // (N s, 2n + m) of the running cost at the samples (q, v, u)
-    const double* hessian = nullptr;   // (N s, 2n + m, 2n + m), or one for all samples
+    const double* gradient = nullptr;  // (N, 2n + m) of the running cost in (x, u) at the start of each step
+    const double* hessian = nullptr;   // (N, 2n + m, 2n + m), or one for all steps
     bool one_hessian = false;
-    const double* velocity = nullptr;   // (N + 1, n, 2n) dv/dx at the nodes, or null for x = (q, v)
-    const double* curvature = nullptr;  // (N, 2n + m, 2n + m) added to the Hessian in (x, u), or null
-    const double* within = nullptr;     // (N, 2n, 2n) Hessian of further costs of the noise's jumps, or null
-    // For each of R decisions:
-    const bool* held = nullptr;    // (R, m) the controls without feed-forward and feedback, or null for none
-    const double* rate = nullptr;  // (R, m, m) Hessian of the cost of the change from the previous control, or null
-    const double* pull = nullptr;  // (R, m) gradient of this cost in the control
 
     int states() const { return 2 * dof; }
     int size() const { return 2 * dof + controls; }
-    bool holds(std::ptrdiff_t decision, int control) const { return held && held[decision * controls + control]; }
-    const double* gradient_at(std::ptrdiff_t point) const { return gradient + point * size(); }
-    const double* hessian_at(std::ptrdiff_t point) const {
-        return one_hessian ? hessian : hessian + point * size() * size();
-    }
+    const double* gradient_at(std::ptrdiff_t s) const { return gradient + s * size(); }
+    const double* hessian_at(std::ptrdiff_t s) const { return one_hessian ? hessian : hessian + s * size() * size(); }
 };
 
 // Gains of u + k + K (x - x_nominal) for each of R decisions, and further results.
 struct Gains {
     double* feedforward = nullptr;       // (R, m)
     double* feedback = nullptr;          // (R, m, 2n)
-    double* previous = nullptr;          // (R, m, m) gains on the previous control, if its change has a cost
     double* control_gradient = nullptr;  // (R, m) gradient of the cost in each control
-    double* costate = nullptr;           // (N, 2n) gradient of the cost after each step in the state there, or null
     double* spread = nullptr;            // (N, 2n, 2n) S, with noise only
     double* factors = nullptr;           // (R, m, m) L D L' of the regularized Quu, or null
 };
@@ -71,7 +48,6 @@ struct LinearizedPlan {
     const double* B = nullptr;            // (N, 2n, m)
     const double* feedforward = nullptr;  // (R, m)
     const double* feedback = nullptr;     // (R, m, 2n)
-    const double* previous = nullptr;     // (R, m, m) gains on the previous control, or null
     const double* slack = nullptr;        // (R, 2, m) lower and upper limit of the change of each control, or null
 };
 
@@ -88,14 +64,10 @@ inline bool predict(const LinearizedPlan& plan, double* state, double* expected,
         const std::ptrdiff_t r = s / hold;
         if (s % hold == 0) {
             std::copy_n(state, size, expected + r * size);
-            const double* before = expected + r * size + x;
             for (int i = 0; i < m; ++i) {
                 double move = plan.feedforward[r * m + i];
                 const double* row = plan.feedback + (r * m + i) * x;
                 for (int c = 0; c < x; ++c) move += row[c] * state[c];
-                if (plan.previous) {
-                    for (int c = 0; c < m; ++c) move += plan.previous[(r * m + i) * m + c] * before[c];
-                }
                 if (plan.slack) {
                     const double* slack = plan.slack + r * 2 * m;
                     limited = limited || move <= slack[i] || move >= slack[m + i];
