@@ -75,7 +75,7 @@ _COUNTS = 3
 # Iterations in which margins follow the motion, and the share of themselves by which they grow in each: a motion that
 # meets wide margins at once is violent, and has wider ones. From 10 to 50, and 0.05 to 0.2.
 _FOLLOWING, _GROWS = 20, 0.1
-# How often margins follow the motion later, and by which share of the largest they have to; the latter from 1e-4 to 1e-2.
+# How often margins follow the motion later, and by which share of the largest they then have to; from 1e-4 to 1e-2.
 _ROUNDS, _MOVES = 30, 1e-3
 # Greatest number of halvings of a trial's steps beyond those that the present motion needs; from 2 to 6.
 _HALVINGS = 4
@@ -221,7 +221,8 @@ class Search:
                 return out
             if not self._regularize():
                 self._calm()
-                if self.violation > FEASIBLE and step.elastic and step.decrease <= _REMOVED * self.weight * self._badness:
+                dear = self.weight * self._badness
+                if self.violation > FEASIBLE and step.elastic and step.decrease <= _REMOVED * dear:
                     return self._infeasible()
                 self.reason = f"no step lowers the cost, whatever the regularization; {self._numbers(tolerance)}"
                 return Status.STALLED
