@@ -514,13 +514,6 @@ class Scene(Frozen):
         return Bounds((lower, upper), (-speed, speed), (-effort, effort))
 
     @cached_property
-    def bound_rows(self) -> Floats:
-        """:attr:`bounds` as an array (3, 2, n)."""
-        rows = np.array(self.bounds)
-        rows.setflags(write=False)
-        return rows
-
-    @cached_property
     def direct_efforts(self) -> bool:
         """Whether the motors' forces are those of the controls: there are neither servos nor kinematic inputs."""
         return not (self.servo_joints or self.inputs)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.core import inside_bounds
 from varpin.finding import Finding, and_more
 from varpin.mechanics.forces import drive_forces, limited_servos, of_kind
 from varpin.mechanics.scene import Scene
@@ -34,12 +33,10 @@ def beyond_limits(scene: Scene, trajectory: Trajectory, extremes: Floats | None 
         found.append(Finding("open loops", f"{text}Use varpin.Scene(robot, {cure})"))
     if not any(scene.bounded):
         return found
-    q, v, u = trajectory.q, trajectory.v, trajectory.u
-    inside = inside_bounds(scene.core, q, v, u, trajectory.u_stages, scene.bound_rows)
-    kept = (inside[0], inside[1], inside[2] and scene.direct_efforts and extremes is None)
+    q, v = trajectory.q, trajectory.v
     bounds = scene.bounds.position, scene.bounds.velocity, scene.bounds.effort
     for kind, (least, most) in enumerate(bounds):
-        if kept[kind] or not scene.bounded[kind]:
+        if not scene.bounded[kind]:
             continue
         values = (q, v, _efforts(scene, trajectory, extremes) if kind == 2 else v)[kind]
         with np.errstate(invalid="ignore"):
