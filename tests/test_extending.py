@@ -22,7 +22,7 @@ from varpin.integrators.tableau import midpoint
 from varpin.io.scenefile.kinds import CONSTRAINTS
 from varpin.mechanics import constraints, forces
 from varpin.mechanics.forces import point_of
-from varpin.mechanics.noise import CompiledFields
+from varpin.mechanics.noise import BoundNoise
 from varpin.simulation import choice
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
@@ -113,10 +113,10 @@ class First(vp.Noise):
 
     strength: float
 
-    def bind(self, actuation):
+    def bind(self, actuation, joints):
         n, m = actuation.shape
         field, nothing = self.strength * np.eye(n)[:, :1], np.zeros((n, 1))
-        return CompiledFields(Diffusion(field, np.zeros((n, 1, m)), nothing, nothing))
+        return BoundNoise(Diffusion(field, np.zeros((n, 1, m)), nothing, nothing))
 
 
 def test_a_noise_kicks_what_it_says():

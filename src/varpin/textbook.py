@@ -153,7 +153,7 @@ def lagrangian(system: System, q: Floats, v: Floats) -> LagrangianJet:
     """L and its derivatives at q (n,), v (n,): those of the bodies, and of the springs."""
     L, Lq, Lv, Lqq, Lvq, M = rigid_bodies(system.model, q, v)
     stretch = q - system.rest
-    energy = 0.5 * system.stiffness @ stretch**2
+    energy = float(0.5 * system.stiffness @ stretch**2)
     return LagrangianJet(L - energy, Lq - system.stiffness * stretch, Lv, Lqq - np.diag(system.stiffness), Lvq, M)
 
 

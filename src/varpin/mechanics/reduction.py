@@ -13,7 +13,7 @@ from varpin.arrays import Floats, Integers, Mask
 from varpin.core.arrays import Coupling, Diffusion
 from varpin.errors import InputError, UnknownJoint
 from varpin.mechanics.forces import Force, of_kind
-from varpin.mechanics.noise import BoundNoise, CompiledFields, Noise
+from varpin.mechanics.noise import BoundNoise
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot, combine
 from varpin.model.loading import hold_joints
@@ -173,9 +173,8 @@ def without(scene: Scene, joints: Mapping[str, float] | Collection[str]) -> Scen
         damping=0.0,
         forces=[part for part in (_part(force, scene, keep, held) for force in scene.forces) if part is not None],
         actuation=actuation[keep],
-        noise=_Rows(_rows(noise, keep, columns)),
         constraints=(),
-    )
+    ).changed(noise=_noise_of(noise, keep, columns))
 
 
 def driving(scene: Scene, held: Collection[str]) -> Integers:
@@ -215,21 +214,11 @@ def _values(value: Any, keep: Integers, held: Mapping[str, float]) -> Any:
     return value[keep] if np.ndim(value) == 1 else value
 
 
-def _rows(fields: Diffusion, keep: Integers, columns: Integers) -> CompiledFields:
+def _noise_of(fields: Diffusion, keep: Integers, columns: Integers) -> BoundNoise:
     """The processes that act on the coordinates ``keep`` in proportion to nothing but the controls ``columns``."""
     acts = (
         fields.constant[keep].any(axis=0) | fields.quadratic[keep].any(axis=0) | fields.control[keep].any(axis=(0, 2))
     )
     rows = np.ix_(keep, acts)
     parts = (fields.constant[rows], fields.control[np.ix_(keep, acts, columns)], fields.quadratic[rows])
-    return CompiledFields(Diffusion(*map(np.ascontiguousarray, (*parts, fields.center[rows]))))
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows(Noise):
-    """Noise whose fields are known."""
-
-    bound: CompiledFields
-
-    def bind(self, actuation: Floats) -> BoundNoise:  # noqa: ARG002
-        return self.bound
+    return BoundNoise(Diffusion(*map(np.ascontiguousarray, (*parts, fields.center[rows]))))

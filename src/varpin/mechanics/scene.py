@@ -45,7 +45,7 @@ from varpin.mechanics.forces import (
     not_negative,
     of_kind,
 )
-from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, NoiseSum, bind
+from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, bind, models_of
 from varpin.model import Robot, degrees_hint, require_robot
 from varpin.model.tree import block_ends, mechanism, path_coordinates
 from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array
@@ -186,12 +186,13 @@ class Scene(Frozen):
         }
         values |= _forces(robot, forces, damping, friction, stiffness, rest)
         values["actuation"] = _served(robot, _actuation(robot, actuation), values["elements"])
-        _refuse_noisy_servos(noise, values["elements"], robot)
+        models = models_of(noise)
+        _refuse_noisy_servos(models, values["elements"], robot)
         values["constraints"] = given_constraints(robot, constraints)
         bound, order = joined([bound_constraint(constraint, robot) for constraint in values["constraints"]])
         _require_positions(robot, values["actuation"], values["elements"], bound)
         values["actuation"], bound = _with_rates(values["actuation"], bound)
-        values["noise"] = bind(noise, _of_forces(values["actuation"], bound), robot.joint_names)
+        values["noise"] = bind(models, _of_forces(values["actuation"], bound), robot.joint_names)
         values |= {"bound_constraints": bound, "constraint_order": order, "announced": set()}
         for name, value in values.items():
             if isinstance(value, np.ndarray):
@@ -634,7 +635,7 @@ class Scene(Frozen):
 
 def quiet(scene: Scene) -> Scene:
     """The scene without its noise."""
-    return scene.changed(noise=bind(None, scene.actuation)) if scene.processes else scene
+    return scene.changed(noise=bind((), scene.actuation, ())) if scene.processes else scene
 
 
 def joints_with(values: ArrayLike, names: Sequence[str]) -> str:
@@ -890,10 +891,8 @@ def _forces(
     }
 
 
-def _refuse_noisy_servos(noise: Noise | Sequence[Noise] | None, elements: Sequence[Element], robot: Robot) -> None:
+def _refuse_noisy_servos(models: Sequence[Noise], elements: Sequence[Element], robot: Robot) -> None:
     """Refuse noise in proportion to the controls of servos: these are positions, whose zero is arbitrary."""
-    given = noise if isinstance(noise, Sequence) else [noise]
-    models = [term for model in given for term in (model.terms if isinstance(model, NoiseSum) else [model])]
     servos = [servo.coordinate for servo in of_kind(elements, "PositionServo")]
     if servos and any(isinstance(model, ControlNoise) for model in models):
         raise InputError(
