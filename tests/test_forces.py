@@ -227,10 +227,7 @@ def test_scenes_with_forces_travel_and_tell_themselves():
         (vp.CoulombFriction(1.0, width=0.0), ("width[0]", "0.0", "0")),
         (vp.CoulombFriction(1.0, breakaway=2.0), ("breakaway", "stribeck_velocity")),
         (vp.CoulombFriction(1.0, 0.1, 0.5, 1.0), ("breakaway[0]", "0.5")),
-        (
-            vp.JointStop(1.0, lower=1.0, upper=-1.0),
-            ("'shoulder_pan_joint'", "1", "-1"),
-        ),
+        (vp.JointStop(1.0, lower=1.0, upper=-1.0), ("lower[0]", "1.0", "upper")),
         (vp.JointStop(1.0, lower=np.inf), ("lower[0]", "inf")),
         ("friction", "forces"),
         ([vp.JointDamper(1.0), 3.0], ("forces", "3.0")),

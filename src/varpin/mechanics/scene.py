@@ -801,7 +801,8 @@ def _resistance(
     if given is None and own.any() and not decided:
         message = "robot %r: the scene leaves out the %s of its description: %s='robot' takes it, %s=0 silences this"
         logger.warning(message, robot.name, name, name, name)
-    return not_negative(name, own if isinstance(given, str) else 0.0 if given is None else given, robot)
+    values: Any = own if isinstance(given, str) else 0.0 if given is None else given
+    return not_negative(name, joint_array(name, values, robot.joint_names, uniform=True))
 
 
 def given_constraints(
@@ -852,7 +853,7 @@ def _forces(
     # Numbers for the damping are a decision on the dry friction, too.
     numbers = damping is not None and not isinstance(damping, str)
     dry = _resistance("friction", friction, robot.friction, robot, decided=rubs or numbers)
-    stiff = not_negative("stiffness", stiffness, robot)
+    stiff = not_negative("stiffness", joint_array("stiffness", stiffness, robot.joint_names, uniform=True))
     slack = joint_array("rest", rest, robot.joint_names, uniform=True)
     if dry.any():
         given = (CoulombFriction(dry), *given)
