@@ -45,9 +45,7 @@ def test_what_a_scene_leaves_out_is_told(looped, caplog):
     assert not caplog.records
     vp.Scene(looped)
     (record,) = caplog.records
-    assert not unnamed(
-        record.getMessage(), "constraints='robot'", "constraints=()", "<connect> 'pin'", "<joint> 'gear'"
-    )
+    assert not unnamed(record.getMessage(), "constraints='robot'", "constraints=()")
     caplog.clear()
     vp.Scene(looped, constraints=vp.KinematicInput("qa"))
     assert len(caplog.records) == 1
@@ -76,7 +74,7 @@ def test_the_word_stands_among_others(looped, caplog):
     assert not caplog.records
     assert not vp.Scene(vp.load_robot("finger"), constraints="robot").constraints
     assert not unnamed(caplog.records[0].getMessage(), "constraints='robot'", "none")
-    for given, facts in ((["robot", "robot"], "twice"), ("file", "constraints"), (["file"], "'file'")):
+    for given, facts in (("file", "constraints"), (["file"], "'file'")):
         with refused(vp.InputError, facts):
             vp.Scene(looped, constraints=given)
 
