@@ -50,11 +50,6 @@ class Required:
         return len(self.joints) + len(self.locked) + len(self.idle)
 
     @property
-    def saved(self) -> float:
-        """Saved share of the linear algebra of a plan, whose work grows with the cube of the number of joints."""
-        return 1.0 - sum(len(part) ** 3 for part in self.parts) / self.described**3
-
-    @property
     def rows(self) -> list[tuple[str, str]]:
         """The report as names and texts."""
         rows = [("computed", f"{len(self.joints)} of {self.described}: {listed(self.joints)}")]
@@ -65,11 +60,7 @@ class Required:
             rows.append(("planned apart", "; ".join(listed(part) for part in self.parts)))
         if self.coupled:
             rows.append(("planned together", self.coupled))
-        return [
-            *rows,
-            *self.terms.items(),
-            ("saved", f"{100 * self.saved:.0f}% of a plan's linear algebra, by counting"),
-        ]
+        return [*rows, *self.terms.items()]
 
     def _repr_html_(self) -> str:
         return facts("What is computed", self.rows)

@@ -395,11 +395,15 @@ class Scene(Frozen):
         """m, the number of controls."""
         return int(self.actuation.shape[1])
 
+    @property
+    def _servos(self) -> tuple[Element, ...]:
+        return of_kind(self.elements, "PositionServo")
+
     @cached_property
     def control_joints(self) -> tuple[str, ...] | None:
         """The joint of each of the m controls; None unless each is the force, or servo position, of a joint alone."""
         joints, gear = np.argmax(self.actuation, axis=0), np.eye(self.robot.dof)
-        for servo in of_kind(self.elements, "PositionServo"):
+        for servo in self._servos:
             gear[servo.coordinate] *= servo.values[0]
         alone = len(set(joints.tolist())) == self.controls
         if not alone or not np.array_equal(self.actuation, gear[:, joints]):
@@ -409,13 +413,13 @@ class Scene(Frozen):
     @cached_property
     def servo_joints(self) -> tuple[str, ...]:
         """The joints whose control is the target position of a servo."""
-        return tuple(self.robot.joint_names[servo.coordinate] for servo in of_kind(self.elements, "PositionServo"))
+        return tuple(self.robot.joint_names[servo.coordinate] for servo in self._servos)
 
     @cached_property
     def holding(self) -> Floats:
         """Matrix (m, n) of the neutral controls at q, ``holding @ q``: see :meth:`command_at`."""
         holding = np.zeros((self.controls, self.robot.dof))
-        for c in (*(servo.coordinate for servo in of_kind(self.elements, "PositionServo")), *self.inputs.values()):
+        for c in (*(servo.coordinate for servo in self._servos), *self.inputs.values()):
             holding[int(np.argmax(np.abs(self.actuation[c]))), c] = 1.0
         return holding
 
@@ -614,38 +618,30 @@ def _unowned(rows: ConstraintRows) -> ConstraintRows:
 def _numbers_of(rows: ConstraintRows) -> dict[str, Floats]:
     """The numbers of constraints by the names of :attr:`Scene.values`; kinds without rows are left out."""
     found: dict[str, Floats] = {}
-    if rows.products:
-        table = []
-        for product in rows.products:
-            numbers = [product.factor, product.constant]
-            for factor in (rows.vectors[product.x], rows.vectors[product.y]):
-                for part in factor:
-                    numbers += [part.body, float(part.direction), *part.place]
-                numbers += [-2.0, 0.0, 0.0, 0.0, 0.0] * (2 - len(factor))
-            table.append(numbers)
-        found["constraints.between"] = np.array(table)
+    products: list[float] = []
+    for product in rows.products:
+        products += [product.factor, product.constant]
+        for part in (*rows.vectors[product.x], *rows.vectors[product.y]):
+            products += [part.body, float(part.direction), *part.place]
+    if products:
+        found["constraints.between"] = np.array(products)
     if rows.ties:
-        ties = np.zeros((len(rows.ties), 2 + max(len(tie.coefficients) for tie in rows.ties)))
-        for row, tie in zip(ties, rows.ties, strict=True):
-            row[: 2 + len(tie.coefficients)] = tie.follower, tie.leader, *tie.coefficients
-        rates = np.array([[float(tie.rate)] for tie in rows.ties])
-        found["constraints.ties"] = np.hstack([ties, rates]) if (rates >= 0).any() else ties
+        most = max(len(tie.coefficients) for tie in rows.ties)
+        table = [
+            (t.follower, t.leader, *t.coefficients, *[0.0] * (most - len(t.coefficients)), t.rate) for t in rows.ties
+        ]
+        found["constraints.ties"] = np.array(table, dtype=np.float64)
     if rows.customs:
-        found["constraints.custom"] = np.array([[float(factor.rows)] for factor in rows.customs])
+        found["constraints.custom"] = np.array([float(factor.rows) for factor in rows.customs])
     return found
 
 
-_KEEPS = "motions and plans do, with varpin.Midpoint() or varpin.Gauss(stages)"
-
-
-def refuse_constraints(scene: Scene, what: object, instead: str = _KEEPS) -> None:
-    """Refuse a scene with constraints in ``what``; the message ends with the alternative ``instead``.
-
-    Raises:
-        InputError: The scene has constraints.
-    """
+def refuse_constraints(
+    scene: Scene, what: object, instead: str = "motions and plans do, with varpin.Midpoint() or varpin.Gauss(stages)"
+) -> None:
+    """Refuse a scene with constraints in ``what``; the message ends with the alternative ``instead``."""
     if scene.constraints:
-        names = ", ".join(dict.fromkeys(type(constraint).__name__ for constraint in scene.constraints))
+        names = scene.terms["constraints"]
         raise InputError(f"{what} does not take scenes with constraints, and this one has {names}: {instead}")
 
 
