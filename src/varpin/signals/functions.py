@@ -15,20 +15,12 @@ from varpin.errors import ControlError, InputError, UnknownJoint
 from varpin.finding import Finding
 from varpin.mechanics.scene import Scene
 from varpin.signals.commands import Times, changing, open_loop
-from varpin.signals.inputs import as_moved, prescribing
+from varpin.signals.inputs import prescribing
 from varpin.signals.moments import Moments, joined, moments_of, none_of
-from varpin.signals.policy import FirstOrderHold, OpenLoop
+from varpin.signals.policy import OpenLoop
 from varpin.support.checks import JointValues, control_values, finite_array, require_finite, takes
 
 ControlLaw = Callable[[float, Floats, Floats], JointValues]
-# Root mean square of what a step's polynomial leaves of a function of time, as a share of its largest value, up to
-# which the motion's own residual shows its error: a third order of it is lost.
-_RESOLVED = 0.02
-# The same share up to which more stages help: a jump has a quarter in a step of two stages, a fast wave more. And the
-# most parts of a step in which it is looked for.
-_FOLLOWED, _MOST_PARTS = 0.3, 64
-# Distance of a kinematic input from its control at the start [rad or m, rad/s or m/s] without a warning.
-_ELSEWHERE = 1e-6
 
 
 def require_law(law: ControlLaw) -> None:
@@ -103,45 +95,28 @@ class Sampled(OpenLoop):
         return prescribing(self.scene, commands, ends)
 
 
-def function_findings(controls: Sampled, duration: float) -> tuple[Finding, ...]:
-    """Warnings: the quadrature of a function of time has not settled in some steps, or no break is in the motion."""
-    found: list[Finding] = []
-    if steps := controls.whole.unsettled.tolist():
-        text = (
-            f"the controls of OpenLoop change too fast in {len(steps)} steps for their impulse to be known "
-            f"(from t = {steps[0] * controls.dt:.3g} s). Name the instants of jumps, OpenLoop(f, breaks=[...])"
-        )
-        found.append(Finding("fast controls", text, time=steps[0] * controls.dt, value=float(len(steps)), unit="steps"))
-    if controls.breaks and not any(0.0 <= at <= duration for at in controls.breaks):
-        text = f"breaks of OpenLoop are from {controls.breaks[0]:.4g} s on, outside the motion: they are in [s]"
-        found.append(Finding("breaks outside", text, time=controls.breaks[0]))
-    return tuple(found)
+def function_findings(controls: Sampled) -> tuple[Finding, ...]:
+    """A warning if the quadrature of a function of time has not settled in some steps."""
+    steps = controls.whole.unsettled.tolist()
+    if not steps:
+        return ()
+    text = (
+        f"the controls of OpenLoop change too fast in {len(steps)} steps for their impulse to be known "
+        f"(from t = {steps[0] * controls.dt:.3g} s). Name the instants of jumps, OpenLoop(f, breaks=[...])"
+    )
+    return (Finding("fast controls", text, time=steps[0] * controls.dt, value=float(len(steps)), unit="steps"),)
 
 
-def resolved(controls: Sampled, times: Times) -> bool:
-    """Whether the polynomials of a method with stages at ``times`` are nearly the function itself in all steps."""
-    found = controls.whole
-    rest = found.rest[:, max(1, len(times)) - 1]
-    return bool(rest.max(initial=0.0) <= _RESOLVED * found.largest) and not len(found.unsettled)
+def left_by_stages(controls: Sampled, stages: int) -> float:
+    """What polynomials through so many stages leave of the function in the worst step, as a share of its largest value.
 
-
-def parts_to_follow(controls: Sampled, times: Times) -> int:
-    """The parts of a step in which polynomials of a method with stages at ``times`` follow the function; 1 where whole.
-
-    They are looked for in the step in which the function is fastest.
-
-    Raises:
-        ControlError: The function failed.
+    A root mean square; infinite where the quadrature of a step has not settled.
     """
-    order = max(1, len(times)) - 1
-    whole = controls.whole
-    worst, parts = int(whole.rest[:, order].argmax()), 1
-    here = whole.part(worst, worst + 1)
-    values = functools.partial(_values, controls, controls.scene)
-    while here.rest[:, order].max() > _FOLLOWED * whole.largest and parts < _MOST_PARTS:
-        parts *= 2
-        here = moments_of(values, worst * parts, parts, controls.dt / parts, controls.breaks)
-    return parts
+    found = controls.whole
+    rest = float(found.rest[:, max(1, stages) - 1].max(initial=0.0))
+    if len(found.unsettled):
+        return math.inf
+    return rest / found.largest if rest > 0.0 else 0.0
 
 
 def _values(controls: OpenLoop, scene: Scene, times: Floats, steps: Integers) -> Floats:
@@ -171,25 +146,6 @@ def _values(controls: OpenLoop, scene: Scene, times: Floats, steps: Integers) ->
             _called(name, alone, lambda value: finite_array(name, value, (1, m)), step, time)
         problem = f"{name} fails for {len(times)} times at once, and for none of them alone: {failure}"
         raise ControlError(*at[0], problem) from failure
-
-
-def begins_elsewhere(controls: OpenLoop | FirstOrderHold, scene: Scene, q0: Floats, v0: Floats) -> tuple[Finding, ...]:
-    """A warning if a kinematic input's control at the first node differs from the motion's start (q0, v0)."""
-    if not scene.inputs:
-        return ()
-    if isinstance(controls, OpenLoop):
-        first = _values(controls, scene, np.zeros(1), np.zeros(1, dtype=np.int64))[0]
-    else:
-        first = controls.u[0]
-    found = []
-    there = as_moved(scene, q0, v0, first)
-    for k in scene.prescribed[np.abs(there - first)[scene.prescribed] > _ELSEWHERE].tolist():
-        text = (
-            f"control {k}, of a KinematicInput, is {first[k]:.6g} at t = 0 and the motion begins with {there[k]:.6g}: "
-            "the joint jumps in the first step. Start there, or give another control"
-        )
-        found.append(Finding("jump at the start", text, time=0.0, value=float(there[k] - first[k])))
-    return tuple(found)
 
 
 def _reader(name: str, scene: Scene) -> Callable[[JointValues], Floats]:
