@@ -35,7 +35,7 @@ from varpin.simulation.choice import usual_integrator
 from varpin.simulation.failures import Interrupted, StepFailure
 from varpin.simulation.limits import beyond_limits
 from varpin.simulation.loop import unstable_loop
-from varpin.simulation.progress import Progress
+from varpin.simulation.record import Progress
 from varpin.simulation.simulate import noise_forgotten, simulate
 from varpin.support.checks import JointValues, control_values, count, positive, real, told_motion
 from varpin.support.frozen import Frozen

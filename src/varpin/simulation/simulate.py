@@ -25,8 +25,7 @@ from varpin.simulation.check import check as checked
 from varpin.simulation.choice import usual_integrator
 from varpin.simulation.failures import Interrupted, NoiseError, StepFailure, named
 from varpin.simulation.loop import unstable_loop
-from varpin.simulation.progress import Progress, Reporter
-from varpin.simulation.record import MotionRecord, function_error, next_block
+from varpin.simulation.record import MotionRecord, Progress, Reporter, function_error, next_block
 from varpin.simulation.start import (
     duration_for_tolerance,
     in_other_units,

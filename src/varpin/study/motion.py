@@ -20,9 +20,9 @@ from varpin.signals.controls import control_rows
 from varpin.signals.inputs import held_in_parts
 from varpin.simulation.check import distance, repeated
 from varpin.simulation.failures import StepFailure
-from varpin.simulation.ladder import ROUNDING, Trial, candidates
 from varpin.simulation.simulate import simulate
 from varpin.simulation.start import on_constraints
+from varpin.simulation.tolerance import ROUNDING, Trial, candidates
 from varpin.support.checks import JointValues, joint_array, positive
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
