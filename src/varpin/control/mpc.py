@@ -28,7 +28,7 @@ from varpin.integrators.base import Failure
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.scene import Scene, closest_controls, require_scene
 from varpin.mechanics.wiener import generator, wiener_increments
-from varpin.signals.inputs import in_parts_of_steps, with_ends
+from varpin.signals.commands import in_parts_of_steps, with_ends
 from varpin.signals.policy import FirstOrderHold
 from varpin.simulation.check import check
 from varpin.simulation.choice import usual_integrator

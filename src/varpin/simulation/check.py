@@ -27,10 +27,9 @@ from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
 from varpin.model import joint_unit
-from varpin.signals.commands import changing, cubics, in_parts, open_loop, rows, shares
+from varpin.signals.commands import changing, cubics, in_parts, in_parts_of_steps, open_loop, prescribing, rows, shares
 from varpin.signals.controls import Controls, commands_of
 from varpin.signals.functions import Sampled, left_by_stages
-from varpin.signals.inputs import in_parts_of_steps, prescribing
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.gate import proven_error
 from varpin.simulation.law import Law, law_of

@@ -18,10 +18,9 @@ from varpin.integrators.base import Failure, join
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
-from varpin.signals.commands import lines, open_loop, rows, steps_of
+from varpin.signals.commands import as_moved, in_parts_of_steps, lines, open_loop, rows, steps_of, with_ends
 from varpin.signals.controls import Controls
 from varpin.signals.functions import ControlLaw, Sampled, decision
-from varpin.signals.inputs import as_moved, in_parts_of_steps, with_ends
 from varpin.simulation.failures import ConstraintError, ForceError
 from varpin.support.checks import told_motion
 from varpin.trajectory import Nodes, Trajectory

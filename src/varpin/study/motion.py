@@ -16,8 +16,8 @@ from varpin.errors import InputError
 from varpin.finding import announce
 from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene, require_scene
+from varpin.signals.commands import held_in_parts
 from varpin.signals.controls import control_rows
-from varpin.signals.inputs import held_in_parts
 from varpin.simulation.check import distance, repeated
 from varpin.simulation.failures import StepFailure
 from varpin.simulation.simulate import simulate
