@@ -35,8 +35,7 @@ from varpin.integrators import Gauss, Integrator, Radau
 from varpin.integrators.registry import require_motion
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene, closest_controls, require_scene, same, tangent_basis
-from varpin.signals.commands import cubics
-from varpin.signals.inputs import as_moved
+from varpin.signals.commands import as_moved, cubics
 from varpin.signals.policy import LinearPolicy, OpenLoop
 from varpin.simulation.choice import usual_integrator, usual_kick
 from varpin.simulation.simulate import simulate
