@@ -54,7 +54,7 @@ def looks_like_degrees(angle: float) -> bool:
 
 def typed_in_degrees(angles: Floats) -> NDArray[np.bool_]:
     """Whether angles [rad] are larger than two turns and have at most one decimal, as someone types degrees."""
-    tenths = 10.0 * angles
+    tenths = 10.0 * np.clip(angles, -_DEGREES, _DEGREES)
     return (np.abs(angles) > _TURNS) & (np.abs(angles) < _DEGREES) & (tenths == np.round(tenths))
 
 
