@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import meshcat
 import numpy as np
@@ -27,14 +27,11 @@ from varpin.mechanics.scene import Scene
 from varpin.model import Robot
 from varpin.show.given import frame_names
 from varpin.show.replay import forms
-from varpin.show.replay.annotations import references, target, target_tracks
-from varpin.show.replay.drawing import draw, joint_motion, mark_name, mark_node
-from varpin.show.replay.marks import KINDS, LABEL, TUBE, Mark, Tie, Triad, translation
-from varpin.show.replay.motion import require_marks
-from varpin.show.replay.page import lowered, open_browser
+from varpin.show.replay.annotations import references, require_marks, rows_at, surroundings
+from varpin.show.replay.drawing import Actor, Script, draw, joint_motion, mark_name, mark_node, tree_positions
+from varpin.show.replay.marks import KINDS, LABEL, TUBE, Tie, translation
+from varpin.show.replay.page import open_browser
 from varpin.show.replay.picture import label
-from varpin.show.replay.script import Actor, Script, rows_at, tree_positions
-from varpin.show.replay.surroundings import goals, parts_of, regions, ties
 from varpin.show.replay.view import set_view
 from varpin.support.checks import flag, positive
 from varpin.trajectory import Nodes
@@ -138,24 +135,11 @@ class LiveView:
 
     def _actor(self, source: object, marks: Marks) -> Actor:
         """The robot at its start, with its marks."""
-        robot = self.robot
-        given = marks.constraints
-        scene, wanted, begin = parts_of(source if given is True and source is not robot else given, None, robot)
-        standing = regions(wanted, np.array([begin]))
-        if moving := [region.name for region in standing if region.way is not None]:
-            logger.warning("a LiveView shows %s where it is at t = %g s; replays move it", " and ".join(moving), begin)
-        targets = [target(name, track, np.zeros(1)) for name, track in target_tracks(marks.targets, 0.0).items()]
-        frames = map(Triad, frame_names("frames", [robot], marks.frames)[0])
-        held = ties(scene)
-        every: tuple[Mark, ...] = (
-            *held,
-            *references(marks.reference),
-            *frames,
-            *standing,
-            *targets,
-            *goals(wanted, targets),
-        )
-        reach = None if held else tree_positions(robot, _postures(robot, self._q))
+        robot, frames = self.robot, frame_names("frames", [self.robot], marks.frames)[0]
+        around = surroundings(robot, marks, frames, source, np.zeros(1), 0.0)
+        closed = any(isinstance(mark, Tie) for mark in around)
+        reach = None if closed else tree_positions(robot, _postures(robot, self._q))
+        every = (*references(marks.reference), *around)
         return Actor(robot, {"robot": tree_positions(robot, self._q[None])}, every, reach=reach)
 
     def __enter__(self) -> Self:
@@ -350,12 +334,6 @@ class _Window(ViewerWindow):
         self.zmq_socket.setsockopt(zmq.RCVTIMEO, int(1000 * _ANSWER_LIMIT))
         self.zmq_socket.setsockopt(zmq.LINGER, 0)
         self.zmq_socket.connect(self.zmq_url)
-
-    def send(self, command: Any) -> None:
-        """Send a command, and wait until the server has accepted it."""
-        words = lowered(command)
-        self.zmq_socket.send_multipart([words["type"].encode(), words["path"].encode(), umsgpack.packb(words)])
-        self.zmq_socket.recv()
 
     def _listen(self) -> None:
         for line in self.server_proc.stderr:
