@@ -29,19 +29,16 @@ class Actor:
 
     Attributes:
         robot: The robot.
-        positions: Positions of every joint of the tree at the keyframes (K, b) [rad or m], by "robot" and, if there is
-            one, "ghost".
+        motions: Configurations at the keyframes (K, n) [rad or m], by "robot" and, if there is one, "ghost".
         marks: What is drawn beside it.
         effort: Torque of each joint of the tree as a share of its limit at the keyframes (K, b), in [0, 1]; None for
             the robot in its own colours.
-        reach: Joint positions (S, b) that the view has to contain; None if the motion is known.
     """
 
     robot: Robot
-    positions: Mapping[str, Floats]
+    motions: Mapping[str, Floats]
     marks: tuple[Mark, ...] = ()
     effort: Floats | None = None
-    reach: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,16 +125,15 @@ class _Drawing:
         pictures = [self.pictures[id(actor.robot)] for actor in self.script.actors]
         swept, axes, size = [], [], 0.0
         for actor, picture in zip(self.script.actors, pictures, strict=True):
-            reach = [] if actor.reach is None else [actor.reach]
-            positions = np.concatenate([*map(samples, actor.positions.values()), *reach])
-            swept.append(picture.swept(positions))
+            q = np.concatenate([*map(samples, actor.motions.values())])
+            swept.append(picture.swept(q))
             size = max(size, float(np.ptp(swept[-1], axis=0).max()))
-            axes.append(picture.body_poses(positions)[0][..., 2].reshape(-1, 3))
+            axes.append(picture.body_poses(q)[0][..., 2].reshape(-1, 3))
         size = size or 1.0
         toward = view_direction(np.concatenate(axes))
         plane = across(toward), np.cross(toward, across(toward))
         figures = [
-            Figure(picture, actor.positions["robot"], size, plane, points)
+            Figure(picture, actor.motions["robot"], size, plane, points)
             for actor, picture, points in zip(self.script.actors, pictures, swept, strict=True)
         ]
         extents = [self._extent(actor, figure) for actor, figure in zip(self.script.actors, figures, strict=True)]
@@ -156,8 +152,8 @@ class _Drawing:
 
     def _robot(self, actor: Actor, picture: Picture, number: str, place: Floats) -> None:
         tree = actor.robot.tree
-        for kind, rows in actor.positions.items():
-            root = f"{kind}{number}"
+        for kind, q in actor.motions.items():
+            root, rows = f"{kind}{number}", tree_positions(actor.robot, q)
             self.viewer[root].set_transform(translation(place))
             nodes = picture.moving_nodes(root)
             for j, node in enumerate(nodes):

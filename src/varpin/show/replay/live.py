@@ -52,8 +52,6 @@ _TEXT_INTERVAL = 0.1
 _TRACE, _BETWEEN = 400, 50
 # Shortest distance of points of a path, and how far bodies may leave the view, relative to the size of the robot.
 _APART, _EDGE = 0.004, 0.1
-# Random postures that give the reach of a robot for the view, and their largest angle from the start [rad].
-_POSTURES, _TURN = 40, np.pi
 
 
 class LiveView:
@@ -64,8 +62,7 @@ class LiveView:
 
     ``progress`` shows the motion of :func:`varpin.simulate` or :meth:`varpin.Mpc.run` up to the present, at most at
     true speed: where computing is faster, it waits. Nothing waits while no browser is connected. At first the robot is
-    in its initial configuration and the camera shows all that it can reach; the camera moves back if that is not
-    enough.
+    in its initial configuration; the camera moves back as its motion needs.
 
     The server belongs to this process. It ends with :meth:`close`, with the ``with`` block or with the process; the
     browser keeps its last picture. The server listens on every network interface of the machine, as meshcat's always
@@ -137,10 +134,7 @@ class LiveView:
         """The robot at its start, with its marks."""
         robot, frames = self.robot, frame_names("frames", [self.robot], marks.frames)[0]
         around = surroundings(robot, marks, frames, source, np.zeros(1), 0.0)
-        closed = any(isinstance(mark, Tie) for mark in around)
-        reach = None if closed else tree_positions(robot, _postures(robot, self._q))
-        every = (*references(marks.reference), *around)
-        return Actor(robot, {"robot": tree_positions(robot, self._q[None])}, every, reach=reach)
+        return Actor(robot, {"robot": self._q[None]}, (*references(marks.reference), *around))
 
     def __enter__(self) -> Self:
         return self
@@ -264,7 +258,7 @@ class LiveView:
             if positions[j] != before[j] or self._shown == -math.inf:
                 self._viewer[node].set_transform(joint_motion(bool(tree.prismatic[j]), positions[j]))
         self._q = row[0]
-        figure = replace(self._figure, positions=positions[None])
+        figure = replace(self._figure, q=row)
         for name, tie in self._ties.items():
             for rod in tie.rod(figure):
                 self._viewer[mark_node(figure.picture, name, rod.node)].set_transform(rod.pose)
@@ -279,7 +273,7 @@ class LiveView:
         # Twice as far as necessary, so that the camera does not move with every picture.
         out = points + np.where(points > high, points - high, 0.0) - np.where(points < low, low - points, 0.0)
         self._in_view = np.concatenate([self._in_view, points, out])
-        set_view(self._viewer, self._in_view, self._stage.toward, self._stage.size)
+        set_view(self._viewer, self._in_view, self._stage.toward, self._stage.size, camera=False)
 
     def _draw_path(self, q: Floats) -> None:
         """Extend the paths of the traced frames over configurations (k, n)."""
@@ -359,13 +353,3 @@ class _Window(ViewerWindow):
         self.zmq_socket.close()
         self.server_proc.kill()
         self.server_proc.wait()
-
-
-def _postures(robot: Robot, start: Floats) -> Floats:
-    """Random configurations (S, n) [rad or m] around ``start``, within the limits."""
-    lower, upper = robot.position_limits
-    turn = np.where(robot.slides, 0.0, _TURN)
-    low = np.where(robot.slides & np.isfinite(lower), lower, np.maximum(lower, start - turn))
-    high = np.where(robot.slides & np.isfinite(upper), upper, np.minimum(upper, start + turn))
-    shares = np.random.default_rng(0).random((_POSTURES, robot.dof))
-    return np.asarray(low + shares * (high - low))

@@ -61,14 +61,14 @@ class Figure:
 
     Attributes:
         picture: The robot's shapes.
-        positions: Positions of the joints of the tree at the keyframes (K, b) [rad or m].
+        q: Configurations at the keyframes (K, n) [rad or m].
         size: Size of a robot's motion [m].
         axes: Unit vectors (3,) to the right and upwards as the camera sees them.
         swept: Points (P, 3) around the robot's motion [m].
     """
 
     picture: Picture
-    positions: Floats
+    q: Floats
     size: float
     axes: tuple[Floats, Floats]
     swept: Floats
@@ -76,7 +76,7 @@ class Figure:
     @cached_property
     def poses(self) -> tuple[Floats, Floats]:
         """World rotations (K, b, 3, 3) and positions (K, b, 3) [m] of the bodies."""
-        return self.picture.body_poses(self.positions)
+        return self.picture.body_poses(self.q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +186,7 @@ class Triad:
         tips = place + _TRIAD * figure.size * rotation.T
         if body < 0:
             return tips
-        R, p = figure.picture.body_poses(samples(figure.positions))
+        R, p = figure.picture.body_poses(samples(figure.q))
         return np.asarray((tips @ R[:, body].transpose(0, 2, 1) + p[:, body, None]).reshape(-1, 3))
 
     def items(self, figure: Figure) -> Iterator[Item]:

@@ -30,7 +30,7 @@ from varpin.show.replay.annotations import (
     target_rows,
     torque_shares,
 )
-from varpin.show.replay.drawing import Actor, Script, tree_positions
+from varpin.show.replay.drawing import Actor, Script
 from varpin.show.replay.marks import Mark
 from varpin.show.replay.page import Inline, inline_page, open_viewer, write_page
 from varpin.show.replay.video import check_film, frame_size, frame_times, write_film
@@ -231,9 +231,9 @@ def _actor(figure: _Figure, robots: Sequence[Robot], k: int, times: Floats) -> A
     traced, frames = (frame_names(name, robots, getattr(marks, name))[k] for name in ("trace", "frames"))
     clock = times if marks.growing else None
     own: list[Mark] = [*references(marks.reference), *paths("motion", robot, traced, t, figure.q, end, clock)]
-    positions = {"robot": tree_positions(robot, rows_at(times, t, figure.q))}
+    motions = {"robot": rows_at(times, t, figure.q)}
     if ghost is not None:
-        positions["ghost"] = tree_positions(robot, rows_at(times, *ghost))
+        motions["ghost"] = rows_at(times, *ghost)
         # The planned configurations of a run jump from plan to plan and have no trace.
         own += paths("ghost", robot, traced, *ghost, end, clock) if marks.ghost is not None else []
     if figure.run is not None and figure.ahead:
@@ -245,7 +245,7 @@ def _actor(figure: _Figure, robots: Sequence[Robot], k: int, times: Floats) -> A
         # Constant over each step; the value of the last step also holds at the end.
         step = np.minimum((times / t[-1] * len(shares) * (1.0 + 1e-12)).astype(int), len(shares) - 1)
         effort = shares[step][:, robot.tree.coordinate]
-    return Actor(robot, positions, tuple(own), effort)
+    return Actor(robot, motions, tuple(own), effort)
 
 
 def _error(figures: Sequence[_Figure]) -> str:

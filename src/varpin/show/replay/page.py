@@ -79,7 +79,7 @@ def _legend(script: Script) -> Iterator[str]:
     if any(actor.effort is not None for actor in script.actors):
         scale = [int.from_bytes(np.rint(255.0 * color).astype(np.uint8).tobytes()) for color in EFFORT_COLORS]
         lines.append(("torque: none, half, all of the limit", scale))
-    if any("ghost" in actor.positions for actor in script.actors):
+    if any("ghost" in actor.motions for actor in script.actors):
         planned = any(mark.kind == "plan" for mark in script.marks)
         lines.append(("plan" if planned else "ghost", [GHOST_COLOR]))
     lines += [(text, [color]) for text, color in legend(script.marks)]
