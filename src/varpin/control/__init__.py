@@ -1,6 +1,5 @@
 """S-DDP: optimal control under noise, within limits and constraints, on any integrator's linearization."""
 
-from varpin.control.checks import looked_at as looked_at
 from varpin.control.history import Iteration as Iteration
 from varpin.control.history import Refined as Refined
 from varpin.control.history import Refinement as Refinement
