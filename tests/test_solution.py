@@ -384,13 +384,3 @@ def test_a_noise_field_that_fails_away_from_the_start_costs_a_trial_and_not_the_
     assert np.abs(sol.trajectory.q[:-1, 0]).max() <= limit  # the last node kicks nothing
     assert sol.cost == problem.cost_of(sol.trajectory)
     assert sol.cost <= sol.history[0].cost
-
-
-def test_verification_says_that_the_search_had_not_converged():
-    problem, *_ = tracking("finger", vp.Midpoint())
-    short, done = vp.solve(problem, max_iterations=1), vp.solve(problem)
-    told, calm = (plan.verify(tolerance=1e-3) for plan in (short, done))
-    assert (told.status, calm.status) == (vp.Status.MAX_ITERATIONS, vp.Status.CONVERGED)
-    assert about(str(told).splitlines()[-1], "unfinished plan")
-    assert about(told._repr_html_(), "unfinished plan")
-    assert not about([str(calm), calm._repr_html_()], "unfinished plan")

@@ -22,7 +22,7 @@ from varpin.control.constraints import (
 )
 from varpin.control.costs import FramePositionCost, TrackingCost, weight_matrix
 from varpin.control.margins import too_small
-from varpin.control.multipliers import FEASIBLE, REPORTED, at_nodes
+from varpin.control.multipliers import FEASIBLE, REPORTED
 from varpin.control.noise import covariances, noise_cost
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
@@ -275,11 +275,10 @@ def _again(solution: Solution) -> list[Played]:
     Raises:
         VarpinError: A custom cost or noise field fails off the plan.
     """
-    problem, known = solution.problem, solution.multipliers
-    margins = None if known is None else at_nodes(problem, known, known.backoff)
-    fine, by = problem.in_parts(PARTS), problem.integrator
+    problem, by = solution.problem, solution.problem.integrator
+    fine = problem.in_parts(PARTS)
     commands = in_parts(problem, solution.controls, solution.policy_on, by, PARTS)
-    return [played(problem, fine, each, by, margins) for each in commands]
+    return [played(problem, fine, each, by) for each in commands]
 
 
 def _dearer(solution: Solution, again: Sequence[Played]) -> Finding | None:
