@@ -149,7 +149,7 @@ def test_the_policy_keeps_its_limits():
         (3.0, ("control_limits", "pair")),
         ((1.0, 2.0, 3.0), ("control_limits", "pair")),
         (("a", 1.0), ("control_limits", "lower")),
-        ("robot", "robot.effort_limit"),
+        ("robot", ("control_limits", "pair")),
         ((np.inf, np.inf), ("control_limits", "inf")),
     ],
 )
