@@ -110,7 +110,6 @@ if TYPE_CHECKING:
     from varpin.control import Status as Status
     from varpin.control import Verification as Verification
     from varpin.control import ViolationOnRobot as ViolationOnRobot
-    from varpin.control import Violations as Violations
     from varpin.control import solve as solve
     from varpin.control.constraints import KeepClear as KeepClear
     from varpin.control.constraints import KeepInBox as KeepInBox
@@ -237,7 +236,6 @@ _LATE: dict[str, tuple[str, ...]] = {
         "Status",
         "Verification",
         "ViolationOnRobot",
-        "Violations",
         "solve",
     ),
     "varpin.study.advice": ("Advice", "Choice", "advise"),
