@@ -163,22 +163,6 @@ def test_ensembles_feed_the_control_before_of_each_path_back(monkeypatch, before
             assert alone.q.tobytes() == paths.q[path].tobytes()
 
 
-def test_noise_of_ones_own_is_stepped_in_python_with_the_same_feedback():
-    """A field that only Python knows, and the same one compiled."""
-
-    policy = random_policy(vp.Scene(sliders(2)), 10, 2, BEFORE)
-    motions = []
-    for noise in (vp.AdditiveNoise(0.4), vp.CustomNoise(lambda q, v, u: 0.4 * np.eye(2), 2)):
-        scene = vp.Scene(sliders(2), gravity=False, damping=0.3, noise=noise)
-        for integrator in (vp.Midpoint(), vp.RungeKutta4()):
-            motions.append(
-                vp.simulate(scene, [0.3, -0.4], [0.5, 0.1], dt=0.05, steps=20, controls=policy, rng=2,
-                            integrator=integrator)
-            )  # fmt: skip
-    for compiled, own in zip(motions[:2], motions[2:], strict=True):
-        np.testing.assert_allclose(own.u, compiled.u, rtol=0, atol=1e-12)
-
-
 def test_the_rest_of_an_optimum_is_the_optimum_of_the_rest():
     """From the control that acted before, and from no other."""
     problem = linear(vp.ControlRateCost(MATRIX), hold=2)
