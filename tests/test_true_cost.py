@@ -1,7 +1,5 @@
 """Plans to a wished true cost."""
 
-import time
-
 import numpy as np
 import pytest
 from findings import about
@@ -9,7 +7,6 @@ from naive import continuous
 from refusals import naming, refused, unnamed
 
 import varpin as vp
-from varpin.control.refine import _halved
 
 
 def reach(steps: int, controls: str = "held", **options: object) -> vp.OptimalControlProblem:
@@ -31,7 +28,6 @@ def test_the_first_step_within_the_wish_is_taken(controls: str) -> None:
     assert all(abs(row.loss) > 1e-4 or row.excess > 1e-4 for row in found.tried[:-1])
     assert found.tried[-1].excess <= 1e-4
     np.testing.assert_allclose([row.dt for row in found.tried], [1 / 3 / 2**k for k in range(len(found.tried))])
-    assert sum(row.share for row in found.tried) == pytest.approx(1.0)
     assert plan.problem.steps == found.tried[-1].steps == plan.trajectory.steps
     assert str(found) in plan.table()
     # Each row is the plan of its step, from whatever controls it began.
@@ -64,15 +60,6 @@ def test_halvings_go_on_until_they_resolve_the_dampers() -> None:
     losses = [row.loss for row in found.tried]
     assert found.met
     assert min(losses[1:4]) > losses[0]
-    # The last halving has changed the cost by so little that no comparison with half the step is needed.
-    last, before = found.tried[-1], found.tried[-2]
-    assert before.cost - last.cost < 3e-3 * last.cost
-    fine = vp.solve(
-        vp.OptimalControlProblem(scene, cost, begin, rest, dt=last.dt / 4, steps=4 * last.steps), check=False
-    )
-    above = last.true_cost / fine.cost - 1.0
-    # A geometric series by a half, where it is by a third.
-    assert above <= last.excess <= 2.5 * above
 
 
 def test_a_warm_start_is_the_plan_before() -> None:
@@ -158,13 +145,6 @@ def test_bad_wishes() -> None:
         vp.solve(reach(4), true_cost=0.0)
     with refused(vp.InputError, "resume"):
         vp.solve(reach(4), resume=plan, true_cost=0.1)
-
-
-def test_the_time_limit_is_for_all_steps() -> None:
-    began = time.perf_counter()
-    plan = vp.solve(reach(4), true_cost=1e-13, time_limit=0.5, check=False)
-    assert not plan.refinement.met
-    assert time.perf_counter() - began < 20.0
 
 
 def within(*constraints: vp.PlanConstraint, dt: float = 0.1, steps: int = 12) -> vp.OptimalControlProblem:
@@ -279,7 +259,6 @@ def test_the_default_integrator_is_chosen_on_each_grid() -> None:
         assert problem.integrator == vp.Radau(4)
         assert problem.at(dt=0.05).integrator == finer
         assert problem.at(dt=0.05, integrator=vp.Midpoint()).integrator == vp.Midpoint()
-        assert _halved(problem)[0].integrator == finer
 
 
 def test_a_loss_within_the_wish_is_no_warning() -> None:
