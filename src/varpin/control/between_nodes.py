@@ -185,11 +185,7 @@ def middles(problem: OptimalControlProblem) -> Instants:
 def followed(problem: OptimalControlProblem, instants: Instants, motion: Trajectory, backoff: list[Floats]) -> Instants:
     """The instants, and those at peaks of a motion that violates constraints between its nodes; itself if none does.
 
-    Args:
-        problem: The problem, without rows between nodes.
-        instants: Those so far.
-        motion: The motion.
-        backoff: Margins of all constraints at the nodes (K, rows).
+    ``backoff`` are the margins (K, rows) of all constraints at the nodes.
     """
     if not any(watched(problem)) or not (problem.linear or problem.between_nodes):
         return instants

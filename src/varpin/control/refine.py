@@ -49,13 +49,8 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
     """Plan with the problem's step, then halve it, each time from the plan before, until the loss is small.
 
     A plan whose loss is within the wish, and that keeps to the constraints on the continuous system, is compared with
-    the plan of half the step, which is the next one where that is cheaper by more than the wish.
-
-    Args:
-        problem: The problem with the coarsest step.
-        search: Makes a plan from a motion; interrupted, it returns one with status INTERRUPTED.
-        wish: Greatest allowed :attr:`Verification.closed_loop_loss`, and excess over the optimum.
-        time_left: Returns the time left [s].
+    the plan of half the step, which is the next one where that is cheaper by more than the wish. A ``search`` makes a
+    plan from a motion; interrupted, it returns one with status INTERRUPTED.
     """
     tried: list[Refined] = []
     best: _Best | None = None
