@@ -270,9 +270,9 @@ def test_sums_scales_and_words():
     ("make", "facts"),
     [
         (lambda: vp.ControlRateCost(-1.0), ("ControlRateCost", "weight", "positive semidefinite")),
-        (lambda: vp.ControlRateCost(1.0, np.nan), ("ControlRateCost", "before", "nan")),
+        (lambda: linear(vp.ControlRateCost(1.0, np.nan)), ("ControlRateCost", "before", "nan")),
         (
-            lambda: vp.ControlRateCost(1.0, np.zeros((2, 2))),
+            lambda: linear(vp.ControlRateCost(1.0, np.zeros((2, 2)))),
             ("before", "(2, 2)"),
         ),
         (lambda: vp.Terminal(vp.ControlRateCost()), ("ControlRateCost", "terminal")),
