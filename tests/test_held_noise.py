@@ -182,3 +182,26 @@ def test_steps_divided_beside_a_limited_drive_are_those_of_a_force_on_the_joint(
         assert (motion.statistics.split_steps > 0) == (given is not None)
         for name in ("q", "p", "energy"):
             np.testing.assert_allclose(getattr(motion, name), getattr(same, name), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("kick", ["left", "held"])
+@pytest.mark.parametrize("ties", ["four-bar", "tie"])
+def test_moments_under_constraints_are_those_of_paths(ties, kick):
+    """Variances along the one direction that the constraints leave, and none across; of a short time."""
+    robot = vp.planar_chain(3 if ties == "four-bar" else 2)
+    tie = vp.PointOnPoint("tip", (1.2, 0.0, -0.4), "xz") if ties == "four-bar" else vp.JointTie("joint2", "joint1")
+    scene = vp.Scene(robot, damping=0.3, noise=vp.AdditiveNoise(0.1), constraints=tie)
+    q = vp.assemble(scene, [-1.0, 1.5, 0.8] if ties == "four-bar" else [0.4, 0.4])
+    given = {"dt": 0.01, "steps": 15, "integrator": vp.Gauss(2, kick=kick)}
+    lin = vp.linearize(scene, vp.simulate(scene, q, np.zeros(robot.dof), increments=0, **given))
+    P = vp.propagate_moments(lin).covariance[-1]
+    paths = vp.simulate_ensemble(scene, q, np.zeros(robot.dof), paths=3000, rng=1, store=True, **given)
+    inertia = vp.lagrangian_jet(scene, paths.q[:, -1].mean(axis=0), np.zeros(robot.dof)).Lvv
+    drawn = np.cov(np.hstack([paths.q[:, -1], paths.v[:, -1] @ inertia]).T)
+    n = robot.dof
+    for block in (slice(0, n), slice(n, 2 * n)):
+        found, expected = drawn[block, block], P[block, block]
+        # The standard error of a variance is sqrt(2 / paths) of it; the constraint bends by a little more.
+        np.testing.assert_allclose(found, expected, rtol=0, atol=4.0 * np.sqrt(2.0 / 3000) * np.trace(expected))
+        least, *_, most = np.linalg.eigvalsh(expected)
+        assert abs(least) < 1e-9 * most
