@@ -73,8 +73,6 @@ def test_refusals() -> None:
             links(sampling=sampling)
     problem = links()
     plan = vp.solve(problem, check=False)
-    with refused(vp.InputError, "second-order", "variational"):
-        vp.solve(links(integrator=vp.RungeKutta4()), second_order=True)
     with refused(vp.InputError, "linear"):
         vp.solve(problem.at(controls="held"), plan)
     with refused(vp.InputError, "before"):

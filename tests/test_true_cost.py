@@ -62,14 +62,6 @@ def test_halvings_go_on_until_they_resolve_the_dampers() -> None:
     assert min(losses[1:4]) > losses[0]
 
 
-def test_a_warm_start_is_the_plan_before() -> None:
-    """Half the step begins with the coarse plan's motion: it takes few iterations."""
-    plan = vp.solve(reach(8), true_cost=1e-5, check=False)
-    tried = plan.refinement.tried
-    assert len(tried) >= 2
-    assert tried[-1].iterations < 0.7 * tried[0].iterations
-
-
 def test_held_periods_stay() -> None:
     plan = vp.solve(reach(8, hold=2), true_cost=1e-5, check=False)
     assert plan.refinement.met
@@ -95,19 +87,6 @@ def test_a_wish_out_of_reach_says_so() -> None:
     )
     stuck = vp.solve(fixed, true_cost=1e-9, check=False)
     assert not unnamed(stuck.refinement.reason, "half of dt", "reference")
-
-
-def test_searches_that_do_not_converge_end_the_halving() -> None:
-    """Nobody gets to a goal out of reach, and smaller steps change nothing."""
-    chain = vp.planar_chain(2)
-    goal = vp.ReachFrame(chain, "tip", position=[40.0, 0.0, 0.0])
-    problem = vp.OptimalControlProblem(
-        vp.Scene(chain, damping=0.1), vp.ControlCost(1e-3), [0.3, 0.2], [0.0, 0.0], dt=0.05, steps=8, constraints=[goal]
-    )
-    found = vp.solve(problem, true_cost=0.01, max_iterations=15, check=False).refinement
-    assert not found.met
-    assert len(found.tried) <= 3
-    assert "ReachFrame" in found.reason or "searches ended" in found.reason
 
 
 @pytest.mark.parametrize("after", [1, 12])
@@ -210,21 +189,6 @@ def test_no_plan_within_constraints() -> None:
     assert about(far.refinement.reason, "no plan within constraints")
 
 
-def test_a_coarse_step_that_is_infeasible() -> None:
-    """One held control accelerates to the end, to twice the mean speed; two of them reach the goal within 1.6 of it."""
-    chain = vp.planar_chain(2)
-    there = np.array([1.0, 0.5])
-    limits = vp.WithinVelocityLimits(chain, (-20.0 * there, 1.6 * there))
-    goal = vp.ReachFrame(chain, "tip", position=chain.frame_positions(there, "tip"))
-    plan = vp.solve(within(limits, goal, dt=1.0, steps=1), true_cost=0.3, check=False)
-    first = plan.refinement.tried[0]
-    assert first.status is vp.Status.INFEASIBLE
-    assert plan.refinement.met
-    assert plan.status.converged
-    _, v = on_robot(plan)
-    assert (v <= 1.6 * there + 1e-3 * 21.6 * there.mean()).all()
-
-
 def goal_problem(steps: int = 3, **options: object) -> vp.OptimalControlProblem:
     goal = vp.ReachFrame(vp.planar_chain(2), "tip", position=vp.planar_chain(2).frame_positions([1.5, -1.0], "tip"))
     return reach(steps, constraints=[goal], **options)
@@ -246,19 +210,6 @@ def test_an_interrupted_comparison_keeps_the_plan() -> None:
     assert [row.steps for row in plan.refinement.tried] == [3]
     assert plan.violation <= 1e-6
     assert plan.cost == pytest.approx(first.cost, rel=1e-6)
-
-
-def test_the_default_integrator_is_chosen_on_each_grid() -> None:
-    """A damper that is stiff for the first step only; an integrator that was given stays."""
-    robot = vp.planar_chain(1)
-    inertia = float(vp.lagrangian_jet(vp.Scene(robot), np.zeros(1), np.zeros(1)).Lvv[0, 0])
-    scene = vp.Scene(robot, damping=inertia * 150.0)
-    cost = vp.TrackingCost([0.1], 1.0) + vp.ControlCost(1e-9)
-    for given, finer in ((None, vp.Gauss(4)), (vp.Radau(4), vp.Radau(4))):
-        problem = vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=0.1, steps=10, integrator=given)
-        assert problem.integrator == vp.Radau(4)
-        assert problem.at(dt=0.05).integrator == finer
-        assert problem.at(dt=0.05, integrator=vp.Midpoint()).integrator == vp.Midpoint()
 
 
 def test_a_loss_within_the_wish_is_no_warning() -> None:
