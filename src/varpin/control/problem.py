@@ -597,7 +597,7 @@ class OptimalControlProblem(Frozen):
         causes no rounding error.
         """
         q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
-        return self.shares_along(q, v, u, self.running.compiled.values(*self.samples(q, v, u)))
+        return self.shares_along(q, v, u, self.running.compiled(*self.samples(q, v, u)))
 
     def shares_along(self, q: Floats, v: Floats, u: Floats, compiled: Floats) -> Floats:
         """:meth:`shares` of a motion, q and v (N + 1, n) and u (N, m), or (N + 1, m) at the nodes.
