@@ -22,7 +22,7 @@ from varpin.integrators.tableau import midpoint
 from varpin.io.scenefile.kinds import CONSTRAINTS
 from varpin.mechanics import constraints, forces
 from varpin.mechanics.forces import point_of
-from varpin.mechanics.noise import CompiledFields
+from varpin.mechanics.noise import BoundNoise
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
 
@@ -112,10 +112,10 @@ class First(vp.Noise):
 
     strength: float
 
-    def bind(self, actuation):
+    def bind(self, actuation, joints):
         n, m = actuation.shape
         field, nothing = self.strength * np.eye(n)[:, :1], np.zeros((n, 1))
-        return CompiledFields(Diffusion(field, np.zeros((n, 1, m)), nothing, nothing))
+        return BoundNoise(Diffusion(field, np.zeros((n, 1, m)), nothing, nothing))
 
 
 def test_a_noise_kicks_what_it_says():
@@ -197,8 +197,8 @@ def bound_to(base, returned):
         ((Element("JointDamper", 0.5, (1.0,)),), ("coordinate", "0.5")),
         ((Element("JointDamper", 0, (1.0, 2.0)),), ("JointDamper", "1 values")),
         ((Element("JointDamper", 0, (np.nan,)),), ("JointDamper", "NaN")),
-        ((Coupling("FrameLoad", 0, 2, (0.0,) * 9),), ("body", "FrameLoad", "2")),
-        ((Coupling("FrameLoad", 0, -2, (0.0,) * 9),), ("body", "FrameLoad", "-2")),
+        ((Coupling("FrameLoad", 0, 2, (0.0,) * 9),), ("a=0", "FrameLoad", "its b", "2")),
+        ((Coupling("FrameLoad", 0, -2, (0.0,) * 9),), ("FrameLoad", "its b", "-2")),
         ((Coupling("FrameLoad", 0, 1, (0.0,) * 3),), ("FrameLoad", "9 values")),
         ((Coupling("JointDamper", 0, 1, (0.0,) * 7),), ("'JointDamper'", "FrameLoad")),
         ((1.0,), ("1.0", "Element", "Coupling")),
@@ -216,12 +216,12 @@ POINT = (Carried(0, False, (0.0, 0.0, 0.0)),)
     ("rows", "labels", "aligned", "facts"),
     [
         (ConstraintRows(((Carried(2, False, (0.0, 0.0, 0.0)),),), (Product(0, 0, 1.0, 1.0),)), 1, (), ("body", "2")),
-        (ConstraintRows((POINT,), (Product(0, 1, 1.0, 1.0),)), 1, (), ("Product", "vector", "1")),
-        (ConstraintRows((POINT,), (Product(-1, 0, 1.0, 1.0),)), 1, (), ("Product", "vector", "-1")),
-        (ConstraintRows(ties=(Tied(0, 2, (1.0,)),)), 1, (), ("Tied", "coordinate", "2")),
-        (ConstraintRows(ties=(Tied(-1, 1, (1.0,)),)), 1, (), ("Tied", "coordinate", "-1")),
+        (ConstraintRows((POINT,), (Product(0, 1, 1.0, 1.0),)), 1, (), ("Product", "its y", "1")),
+        (ConstraintRows((POINT,), (Product(-1, 0, 1.0, 1.0),)), 1, (), ("Product", "its x", "-1")),
+        (ConstraintRows(ties=(Tied(0, 2, (1.0,)),)), 1, (), ("Tied", "its leader", "2")),
+        (ConstraintRows(ties=(Tied(-1, 1, (1.0,)),)), 1, (), ("Tied", "its follower", "-1")),
         (ConstraintRows(ties=(Tied(0, 1, (1.0,)),)), 2, (), ("2 labels", "1 rows")),
-        (ConstraintRows((POINT,), (Product(0, 0, 1.0, 1.0),)), 1, ((0, 1),), ("aligned", "vector", "1")),
+        (ConstraintRows((POINT,), (Product(0, 0, 1.0, 1.0),)), 1, ((0, 1),), ("its y", "1")),
     ],
 )
 def test_rows_that_the_core_cannot_take_are_refused_by_name(rows, labels, aligned, facts):
