@@ -10,7 +10,6 @@
 #include <string>
 #include <vector>
 
-#include "varpin/body.hpp"
 #include "varpin/constraints.hpp"
 #include "varpin/couplings.hpp"
 #include "varpin/forces.hpp"
