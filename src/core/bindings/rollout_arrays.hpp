@@ -76,9 +76,9 @@ inline Commands commands_of(const Mechanism& mechanism, nb::handle commands, std
                  .within = optional_field<In<3>>(commands, "within", {N, s, m}),
                  .stage_times = optional_field<In<1>>(commands, "stage_times", {s}),
                  .own = static_cast<std::ptrdiff_t>(own)};
-    if (out.gains) out.reference = field<In<2>>(commands, "reference", {R, width});
     if (out.gains && width != 2 * n && width != 2 * n + m)
         throw std::invalid_argument("gains must have a column for each of (q, p) or (q, p, previous control)");
+    if (out.gains) out.reference = field<In<2>>(commands, "reference", {R, width});
     if (out.stage_times && ((!out.before && N > 0) || out.within))
         throw std::invalid_argument("linear controls need the control before the first step, and none at stages");
     if (out.within && (out.gains || hold != 1))

@@ -15,7 +15,7 @@ Bytes = NDArray[np.uint8]
 class Mechanism:
     """A tree of bodies with the forces, constraints, actuation and noise of a scene.
 
-    The fields are described in src/core/include/varpin/tree.hpp.
+    The fields are described in src/core/include/varpin/mechanism.hpp.
     """
 
     @staticmethod

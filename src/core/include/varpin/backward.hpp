@@ -30,7 +30,7 @@ class BackwardPass {
     // A pass over a block of steps, with each control held over `hold` of them; blocks follow each other from the last
     // to the first. Returns -1, or the decision without a minimum.
     std::ptrdiff_t run(double h, int hold, double regularization, const ExpandedSteps& steps, const Gains& gains) {
-#if defined(__x86_64__) && defined(__GNUC__)
+#if defined(__x86_64__)
         if (has_avx2()) return run_avx2(h, hold, regularization, steps, gains);
 #endif
         return run_steps(h, hold, regularization, steps, gains);
@@ -42,7 +42,7 @@ class BackwardPass {
     Found found;
 
   private:
-#if defined(__x86_64__) && defined(__GNUC__)
+#if defined(__x86_64__)
     [[gnu::target("avx2"), gnu::flatten]] std::ptrdiff_t run_avx2(double h, int hold, double regularization,
                                                                   const ExpandedSteps& steps, const Gains& gains) {
         return run_steps(h, hold, regularization, steps, gains);

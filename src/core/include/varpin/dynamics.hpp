@@ -13,9 +13,9 @@
 #include "varpin/dense.hpp"
 #include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
+#include "varpin/mechanism.hpp"
 #include "varpin/slopes.hpp"
 #include "varpin/spatial.hpp"
-#include "varpin/tree.hpp"
 
 namespace varpin {
 

@@ -19,11 +19,11 @@
 #include "varpin/dense.hpp"
 #include "varpin/elimination_rows.hpp"
 #include "varpin/jet.hpp"
+#include "varpin/mechanism.hpp"
 #include "varpin/spatial.hpp"
 #include "varpin/subtree_sums.hpp"
 #include "varpin/symmetric_elimination.hpp"
 #include "varpin/tableau.hpp"
-#include "varpin/tree.hpp"
 
 namespace varpin {
 
