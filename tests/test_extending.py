@@ -14,7 +14,7 @@ from refusals import refused
 
 import varpin as vp
 from varpin.cli import command
-from varpin.core import coupling_kinds, element_kinds, pulls_fast
+from varpin.core import coupling_kinds, element_kinds
 from varpin.core.arrays import Carried, ConstraintRows, Coupling, Diffusion, Element, Product, Tied
 from varpin.integrators import registry
 from varpin.integrators.collocation import Collocation
@@ -23,7 +23,6 @@ from varpin.io.scenefile.kinds import CONSTRAINTS
 from varpin.mechanics import constraints, forces
 from varpin.mechanics.forces import point_of
 from varpin.mechanics.noise import BoundNoise
-from varpin.simulation import choice
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
 
@@ -240,8 +239,8 @@ def test_the_page_names_files_that_are_there():
     assert named <= found
 
 
-def test_q0_takes_the_way_that_the_page_says(monkeypatch):
-    """Its Python functions are called in its order, and the core is asked between the choice and the start."""
+def test_q0_takes_the_way_that_the_page_says():
+    """Its Python functions are called in its order."""
     listed = re.search(r"\*\*`q0` from(.*?)\*\*A torque", PAGE.read_text(encoding="utf-8"), re.S).group(1)
     way = re.findall(r"^\d+\. `([\w/]+\.\w+)`: (?:`(\w+)`)?", listed, re.M)
     assert len({file for file, _ in way}) == 12
@@ -252,11 +251,6 @@ def test_q0_takes_the_way_that_the_page_says(monkeypatch):
         if event == "call" and root in (path := Path(frame.f_code.co_filename)).parents:
             called.append((path.relative_to(root).as_posix(), frame.f_code.co_name))
 
-    def asked(*given):
-        called.append(("checks.hpp", "pulls_fast"))
-        return pulls_fast(*given)
-
-    monkeypatch.setattr(choice, "pulls_fast", asked)
     before = sys.getprofile()
     sys.setprofile(note)
     try:
@@ -265,6 +259,5 @@ def test_q0_takes_the_way_that_the_page_says(monkeypatch):
         sys.setprofile(before)
     rest = iter(called)
     for place in way:
-        if place[0].endswith(".py") or place in called:
+        if place[0].endswith(".py"):
             assert place in rest, place
-    assert ("checks.hpp", "pulls_fast") in way

@@ -99,9 +99,10 @@ class SearchState:
         growth: Last factor of the regularization.
         first: Cost at stake on the first motion; -1 before it is known.
         counts: How often margins have been widened by counting motions.
-        since: Number of iterations before rows between nodes or margins were last widened.
+        since: The first iteration from which on rows and margins stay.
         second_order: Whether it uses second derivatives of the steps.
         iterations: Number of entries of the history that were made before.
+        rounds: How often margins have followed the motion of a search that ended, since then.
     """
 
     weight: float
@@ -112,6 +113,7 @@ class SearchState:
     since: int
     second_order: bool
     iterations: int
+    rounds: int = 0
 
 
 def part(loss: float) -> str:

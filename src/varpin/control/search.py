@@ -72,7 +72,10 @@ _MET, _APPROACHED = 1e-6, 0.9
 _CLOSE = 1e-3
 # How often margins are widened by counting motions.
 _COUNTS = 3
-# How often margins may follow the motion, and by which share of themselves they have to; the latter from 1e-4 to 1e-2.
+# Iterations in which margins follow the motion, and the share of themselves by which they grow in each: a motion that
+# meets wide margins at once is violent, and has wider ones. From 10 to 50, and 0.05 to 0.2.
+_FOLLOWING, _GROWS = 20, 0.1
+# How often margins follow the motion later, and by which share of the largest they then have to; from 1e-4 to 1e-2.
 _ROUNDS, _MOVES = 30, 1e-3
 # Greatest number of halvings of a trial's steps beyond those that the present motion needs; from 2 to 6.
 _HALVINGS = 4
@@ -119,7 +122,8 @@ class Search:
         self.first = -1.0  # cost at stake on the first motion; -1 before it is known
         self.added: list[Floats] | None = None  # to margins at the nodes
         self.counts = 0
-        self.since = 0  # iterations before rows between nodes or margins were last widened
+        self.since = 0  # the first iteration from which on rows and margins stay
+        self.rounds = 0  # how often margins have followed the motion of a search that ended
         self.history: list[Iteration] = []
         self.cost = np.inf
         self.reason, self.deadline = "", np.inf
@@ -130,10 +134,10 @@ class Search:
         self.exact = self.unsolved = False
         self.stages: Stages | None = None
         self._passes = 0  # backward passes since the last entry of the history
-        self._due, self._rounds = False, 0  # margins are to be taken; how often they have followed the motion
         robot = problem.scene.robot.name
         self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {problem.t0:g} s"
         self._enforce(NOWHERE)
+        self.since = self._until()
 
     def begin(self, commands: Commands) -> None:
         """Begin with the motion under commands.
@@ -155,7 +159,8 @@ class Search:
         state, known = plan.search, plan.multipliers
         assert state is not None
         self._move(plan.trajectory, self.problem.shares(plan.trajectory))
-        self.weight, self.first, self.counts, self.since = state.weight, state.first, state.counts, state.since
+        self.weight, self.first, self.counts = state.weight, state.first, state.counts
+        self.since, self.rounds = state.since, state.rounds
         self.regularization, self.growth = state.regularization, state.growth
         self.second_order = self.second_order or state.second_order
         self.history = list(plan.history[: state.iterations])
@@ -216,7 +221,8 @@ class Search:
                 return out
             if not self._regularize():
                 self._calm()
-                if step.elastic and step.decrease <= _REMOVED * self.weight * self._badness:
+                dear = self.weight * self._badness
+                if self.violation > FEASIBLE and step.elastic and step.decrease <= _REMOVED * dear:
                     return self._infeasible()
                 self.reason = f"no step lowers the cost, whatever the regularization; {self._numbers(tolerance)}"
                 return Status.STALLED
@@ -270,6 +276,7 @@ class Search:
             first=self.first,
             counts=self.counts,
             since=self.since,
+            rounds=self.rounds,
             second_order=self.second_order,
             iterations=len(self.history),
         )
@@ -297,8 +304,9 @@ class Search:
             self.noise = self._pass(0.0) or plan
         if self._has_goals:
             self.plan = self._pass_to_goals() or plan
-        if self._due and problem.processes and not self.tick:
-            self._take_margins(self.plan)
+        if len(self.history) < self.since:
+            most = 0.0 if self.step is not None and self.step.elastic else _GROWS
+            self.backoff = [a + np.minimum(b - a, most * b) for a, b in self._margins_and(self.plan)]
         # The step is the pass's own, where that keeps to all limits and rows.
         plain = self.regularization == 0.0 and not self._has_goals
         free = not self.bound and (not problem.limited or self._is_free(plan, ()))
@@ -407,20 +415,30 @@ class Search:
                 pushes.append(push.ravel() * item.scale)
         return stages.costates(rows, pushes)
 
-    def _take_margins(self, plan: Plan) -> None:
-        """Margins of all rows, in their units: standard deviations under the plan's feedback, and what is added."""
-        self._due = False
+    @property
+    def _has_margins(self) -> bool:
+        return bool(self.problem.processes) and any(item.source.margin > 0.0 for item in self.bound)
+
+    def _until(self) -> int:
+        """The first iteration from which on rows and margins stay, as rows are new: margins follow the motion first."""
+        return len(self.history) + (_FOLLOWING if self._has_margins and not self.tick else 0)
+
+    def _margins_and(self, plan: Plan) -> list[tuple[Floats, Floats]]:
+        """Margins of all rows, in their units, as they are used and of the motion.
+
+        The latter are standard deviations under the plan's feedback, and what is added.
+        """
         kept = [item for item in self.bound if item.source.margin > 0.0]
-        if not kept:
-            return
         spreads = iter(deviations(self.along, Feedback(plan.feedback, plan.previous), kept))
         more = [np.zeros(1)] * len(self.bound)
         if self.added is not None:
             more = [*self.added, *(self.added[i][self.between.of(i)[:, 0]] for i in self.between.constraints)]
-        for k, item in enumerate(self.bound):
+        found = []
+        for item, used, extra in zip(self.bound, self.backoff, more, strict=True):
             own = item.source.margin * next(spreads) if item.source.margin > 0.0 else np.zeros(item.shape)
-            used = item.in_force if isinstance(item, BoundBetween) else True
-            self.backoff[k] = np.where(used, own + more[k], 0.0)
+            there = item.in_force if isinstance(item, BoundBetween) else True
+            found.append((used, np.where(there, own + extra, 0.0)))
+        return found
 
     def _ended(self, tolerance: float) -> Status | None:
         """The status of a search whose step gains no more than the tolerance; None if it goes on."""
@@ -477,8 +495,7 @@ class Search:
                 if not self._made():
                     self.regularization = kept
                     self._made()
-        margins = any(item.source.margin > 0.0 for item in self.bound)
-        if problem.processes and problem.limited and not (margins or self._has_goals or self.tick):
+        if problem.processes and problem.limited and not (self._has_margins or self._has_goals or self.tick):
             # Controls at their limits do not react to noise, and the plan tells what it costs then.
             u, (lower, upper) = problem.decided(self.trajectory), problem.control_limits
             held = self._pass(0.0, fixed=(u <= lower) | (u >= upper))
@@ -488,8 +505,8 @@ class Search:
         """Whether there are further rows between nodes, or wider margins, before a search ends."""
         if self.tick:
             return False
-        if ended is not None and self._margins_move():
-            self.since, self.reason = len(self.history), ""
+        if ended is not None and self._margins_move(ended):
+            self.reason = ""
             return True
         if ended is Status.INFEASIBLE:
             return False
@@ -499,40 +516,39 @@ class Search:
             kept, margins = self.multipliers[:count], self.backoff[:count]
             self._enforce(made)
             self.multipliers[:count], self.backoff[:count] = kept, margins
-            self._due = any(part.any() for part in margins)
         elif ended is None or not self._counts_motions():
             return False
-        self.since = len(self.history)
+        self.since, self.rounds = self._until(), 0
         return True
 
     def _counts_motions(self) -> bool:
         """Whether margins become wider, as motions under noise violate bounds more often than these promise."""
-        narrow = self.problem.processes and any(item.source.margin > 0.0 for item in self.bound)
-        if not narrow or self.counts >= _COUNTS:
+        if not self._has_margins or self.counts >= _COUNTS:
             return False
         self.counts += 1
         more = None
         with contextlib.suppress(VarpinError):
             more = widened(self.solution(Status.CONVERGED))
-        self.added, self._due = (self.added, self._due) if more is None else (more, True)
+        self.added = self.added if more is None else more
         return more is not None
 
-    def _margins_move(self) -> bool:
+    def _margins_move(self, ended: Status) -> bool:
         """Whether the margins of the motion are others than those that it was found with; they then follow it.
 
-        In between they stay: a merit whose rows move with the motion has no minimum. The first search is without them.
+        In between they stay: a merit whose rows move with the motion has no minimum.
         """
-        if self.plan is None or not self.problem.processes or self._rounds >= _ROUNDS:
+        if self.plan is None or not self._has_margins or self.rounds >= _ROUNDS:
             return False
-        before = list(self.backoff)
-        self._take_margins(self.plan)
-        if all((np.abs(b - a) <= _MOVES * a).all() for a, b in zip(before, self.backoff, strict=True)):
-            self.backoff = before
+        pairs = self._margins_and(self.plan)
+        # Each time a smaller part of the way: a motion far from its rows has small margins, which let it come near
+        # again. What cannot be met is violent, and does not widen margins.
+        share, most = 1.0 / (1.0 + self.rounds), 0.0 if ended is Status.INFEASIBLE else _GROWS
+        moves = [np.minimum(share * (b - a), most * b) for a, b in pairs]
+        if all((np.abs(move) <= _MOVES * b.max(axis=0)).all() for move, (_, b) in zip(moves, pairs, strict=True)):
             return False
-        if any(part.any() for part in before):
-            # Half of the way: a motion far from its rows has small margins, which let it come near again.
-            self.backoff = [0.5 * (a + b) for a, b in zip(before, self.backoff, strict=True)]
-        self._rounds += 1
+        if len(self.history) >= self.since:
+            self.since, self.rounds = len(self.history), self.rounds + 1
+        self.backoff = [a + move for move, (a, _) in zip(moves, pairs, strict=True)]
         return True
 
     def _line_search(self) -> Taken:

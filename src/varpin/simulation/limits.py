@@ -8,7 +8,6 @@ from __future__ import annotations
 import numpy as np
 
 from varpin.arrays import Floats, Mask
-from varpin.core import inside_bounds
 from varpin.finding import Finding, and_more
 from varpin.mechanics.forces import drive_forces, limited_servos, of_kind
 from varpin.mechanics.scene import Scene
@@ -35,11 +34,9 @@ def beyond_limits(scene: Scene, trajectory: Trajectory, extremes: Floats | None 
     bounded: Mask = np.asarray(np.isfinite(scene.bounds).any(axis=(1, 2)))
     if not bounded.any():
         return found
-    q, v, u = trajectory.q, trajectory.v, trajectory.u
-    inside = inside_bounds(scene.core, q, v, u, trajectory.u_stages, scene.bounds)
-    kept = (inside[0], inside[1], inside[2] and scene.direct_efforts and extremes is None)
+    q, v = trajectory.q, trajectory.v
     for kind, (least, most) in enumerate(scene.bounds):
-        if kept[kind] or not bounded[kind]:
+        if not bounded[kind]:
             continue
         values = (q, v, _efforts(scene, trajectory, extremes) if kind == 2 else v)[kind]
         with np.errstate(invalid="ignore"):
