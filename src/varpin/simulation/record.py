@@ -12,7 +12,7 @@ import numpy as np
 from varpin._version import __version__
 from varpin.arrays import Floats
 from varpin.core.arrays import Commands
-from varpin.errors import ControlError, StepError, VarpinError
+from varpin.errors import ControlError, InputError, StepError, VarpinError
 from varpin.integrators import Integrator, Segment
 from varpin.integrators.base import Failure, join
 from varpin.mechanics.constraints import CustomConstraintError
@@ -21,12 +21,16 @@ from varpin.mechanics.scene import Scene
 from varpin.signals.commands import as_moved, in_parts_of_steps, lines, open_loop, rows, steps_of, with_ends
 from varpin.signals.controls import Controls
 from varpin.signals.functions import ControlLaw, Sampled, decision
-from varpin.simulation.failures import ConstraintError, ForceError
+from varpin.simulation.failures import ConstraintError, ForceError, NoiseError
 from varpin.support.checks import told_motion
 from varpin.trajectory import Nodes, Trajectory
 
 # Number of segments from which on they are joined into one.
 _PARTS = 256
+_KINDS: dict[type[VarpinError], type[StepError]] = {
+    CustomForceError: ForceError,
+    CustomConstraintError: ConstraintError,
+}
 
 Progress = Callable[[int, int], None] | Callable[[int, int, Nodes], None]
 # Longest time between two calls of a function that gets the motion [s], except within a chunk of steps.
@@ -99,19 +103,38 @@ class MotionRecord:
         self._parts: list[Segment] = []
         self._within: list[Floats] = []
 
-    def add(self, segment: Segment, within: Floats) -> None:
-        """Append steps, with the controls at their stages (N, s, m)."""
+    def advance(
+        self, state: object, controls: Controls | ControlLaw, commands: Commands, most: int, steps: int
+    ) -> Segment:
+        """Append about ``most`` steps on the way to ``steps`` in all; the arguments are those of :func:`next_block`.
+
+        Raises:
+            StepError: A user's function failed; the error has the motion so far.
+        """
+        try:
+            block = next_block(controls, commands, self, most, steps - self.steps)
+        except ControlError as error:
+            raise error.after(self.trajectory()) from error.__cause__
+        drawn = self.dw[None, self.steps : self.steps + steps_of(block)] if len(self.dw) else self.dw[None, :0][:0]
+        try:
+            (segment,) = self.integrator.rollout(self.scene, state, block, drawn, self.dt)
+        except (CustomForceError, CustomConstraintError, InputError) as error:
+            now = self.trajectory()
+            kind = next((own for cause, own in _KINDS.items() if isinstance(error, cause)), NoiseError)
+            cause = error.__cause__ if kind is NoiseError else error
+            raise kind(now.steps, float(now.t[-1]), str(error), now) from cause
         if not len(segment.q):
-            return
+            return segment
         self.steps += len(segment.q)
         self.last = segment
         self._parts.append(segment)
-        if len(within):
-            self._within.append(within[: len(segment.q)])
+        if len(block.within):
+            self._within.append(block.within[: len(segment.q)])
         # A segment of one step takes many times the memory of its numbers.
         if len(self._parts) == _PARTS:
             self._joined.append(join(self._parts))
             self._parts = []
+        return segment
 
     def trajectory(self) -> Trajectory:
         """The motion so far."""
@@ -184,13 +207,6 @@ def trajectory_of(
     )
 
 
-def function_error(error: CustomForceError | CustomConstraintError, record: MotionRecord, where: str = "") -> StepError:
-    """The error of a user's function that failed in the step after the record."""
-    now = record.trajectory()
-    kind = ForceError if isinstance(error, CustomForceError) else ConstraintError
-    return kind(now.steps, float(now.t[-1]), f"{where}{error}", now)
-
-
 def located(
     scene: Scene,
     integrator: Integrator,
@@ -208,16 +224,12 @@ def located(
     state, (first,) = integrator.start(scene, start[0][None], start[1][None])
     dw = np.zeros((0, scene.processes)) if increments is None else increments
     record = MotionRecord(scene, integrator, dt, dw, first, commands if len(commands.stage_times) else None)
-    while record.steps < steps_of(commands):
-        block = next_command(commands, record)
-        drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
-        try:
-            (segment,) = integrator.rollout(scene, state, block, drawn, dt)
-        except (CustomForceError, CustomConstraintError) as found:
-            return function_error(found, record, where)
-        record.add(segment, block.within)
-        if segment.failure is not None:
-            break
+    steps = steps_of(commands)
+    try:
+        while record.steps < steps and record.advance(state, None, commands, 1, steps).failure is None:
+            pass
+    except StepError as found:
+        return type(found)(found.step, found.time, f"{where}{found.problem}", found.trajectory)
     # The function did not fail this time: its result depends on more than its arguments.
     return error
 
