@@ -27,7 +27,8 @@ from varpin.trajectory import Nodes, Trajectory
 
 # Number of segments from which on they are joined into one.
 _PARTS = 256
-_KINDS: dict[type[VarpinError], type[StepError]] = {
+# The error of a step for that of a user's function; of noise for any other.
+_OF_STEPS: dict[type[InputError], type[StepError]] = {
     CustomForceError: ForceError,
     CustomConstraintError: ConstraintError,
 }
@@ -120,7 +121,7 @@ class MotionRecord:
             (segment,) = self.integrator.rollout(self.scene, state, block, drawn, self.dt)
         except (CustomForceError, CustomConstraintError, InputError) as error:
             now = self.trajectory()
-            kind = next((own for cause, own in _KINDS.items() if isinstance(error, cause)), NoiseError)
+            kind = _OF_STEPS.get(type(error), NoiseError)
             cause = error.__cause__ if kind is NoiseError else error
             raise kind(now.steps, float(now.t[-1]), str(error), now) from cause
         if not len(segment.q):
