@@ -157,12 +157,8 @@ def linearize_steps(
     it. ``ramps`` asks for the derivatives in controls that change within a step.
     """
     n, m, steps = scene.robot.dof, scene.controls, trajectory.steps
-    ramp = None
-    if ramps:
-        Jx, Jf, Jk, in_ramp = integrator.linearize_with_ramps(scene, trajectory)
-        ramp = in_ramp @ scene.transmission
-    else:
-        Jx, Jf, Jk = integrator.linearize(scene, trajectory)
+    Jx, Jf, Jk, Jr = integrator.linearize(scene, trajectory, ramps=ramps)
+    ramp = Jr @ scene.transmission if ramps else None
     q, v = trajectory.q, trajectory.v
     if ramp is not None and scene.inputs:
         # Only the end of a step counts.

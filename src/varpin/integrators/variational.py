@@ -219,19 +219,16 @@ class Variational(Compiled):
             state.paths.kick(self.left * impulse[None])
         return self.rollout_compiled(scene, state, command, scene.silence, drift[None, None], dt, held)[0]
 
-    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
+    def linearize(
+        self, scene: Scene, trajectory: Trajectory, *, ramps: bool = False
+    ) -> tuple[Floats, Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, p).
 
         Divided steps are repeated in the same parts, and the derivatives of the parts are multiplied.
         """
-        Jx, Jf, _ = self._derivatives(scene, trajectory)
-        return Jx, Jf, self._kicks(scene, trajectory, Jx, Jf)
-
-    def linearize_with_ramps(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
-        if not self.stage_times:
-            return super().linearize_with_ramps(scene, trajectory)
-        Jx, Jf, Jr = self._derivatives(scene, trajectory, ramp=True)
-        return Jx, Jf, self._kicks(scene, trajectory, Jx, Jf), Jr
+        ramp = ramps and bool(self.stage_times)
+        Jx, Jf, Jr = self._derivatives(scene, trajectory, ramp=ramp)
+        return Jx, Jf, self._kicks(scene, trajectory, Jx, Jf), Jr if ramp else 0.5 * Jf
 
     def _kicks(self, scene: Scene, trajectory: Trajectory, Jx: Floats, Jf: Floats) -> Floats:
         """The derivatives in the noise impulse, from those in the state and in a constant force."""
