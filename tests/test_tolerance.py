@@ -183,7 +183,7 @@ def law(t, q, v):
     [
         ({"dt": 1e-3, "duration": 1.0, "tolerance": 1e-6}, ("dt", "tolerance")),
         ({"steps": 10, "tolerance": 1e-6}, ("steps", "tolerance")),
-        ({"tolerance": 1e-6}, ("tolerance", "duration")),
+        ({"tolerance": 1e-6}, "duration"),
         ({"duration": 1.0, "tolerance": 0.0}, "tolerance"),
         ({"duration": -1.0, "tolerance": 1e-6}, "duration"),
         ({"duration": 1.0, "tolerance": 1e-6, "controls": law}, "tolerance"),

@@ -421,26 +421,22 @@ def _integrator_of(scene: Scene, trajectory: Trajectory, given: Integrator | Non
     linear = trajectory.u_nodes.shape[1] > 0
     if trajectory.dw.shape[1] not in (scene.processes, scene.increments(linear=linear)):
         raise InputError(f"the trajectory has {trajectory.dw.shape[1]} processes, the scene {scene.processes}")
-    made: Integrator | None = None
-    problem = ""
+    if given is not None and not isinstance(given, Integrator):
+        raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {given!r}")
+    if given is not None and str(given) == trajectory.integrator:
+        return given
     try:
         made = integrator_of(trajectory.integrator)
-    except InputError as error:
-        problem = str(error)
-    if given is None:
-        if made is None:
-            raise InputError(
-                f"the trajectory was made with {trajectory.integrator}, which cannot be made again ({problem}): "
-                "give integrator="
-            )
-        return made
-    if not isinstance(given, Integrator):
-        raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {given!r}")
-    if str(given) != trajectory.integrator and (made is None or not given.same_map(made)):
+    except InputError as problem:
+        raise InputError(
+            f"the trajectory was made with {trajectory.integrator}, which cannot be made again ({problem}): "
+            "give integrator="
+        ) from None
+    if given is not None and not given.same_map(made):
         raise InputError(
             f"the trajectory was made with {trajectory.integrator}, not {given}: leave integrator out, or give that one"
         )
-    return given
+    return given or made
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,13 +25,12 @@ from varpin.simulation.failures import Interrupted, StepFailure, named
 from varpin.simulation.loop import unstable_loop
 from varpin.simulation.record import MotionRecord, Progress, Reporter
 from varpin.simulation.start import (
-    duration_for_tolerance,
     in_other_units,
     on_constraints,
     time_steps,
 )
 from varpin.simulation.tolerance import steps_for_tolerance
-from varpin.support.checks import JointValues, as_floats, count, flag, joint_array, require_memory
+from varpin.support.checks import JointValues, as_floats, count, flag, joint_array, positive, require_memory
 from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -137,7 +136,9 @@ def simulate(
     if scene.constraints:
         q0, v0, moved = on_constraints(scene, q0, v0)
     if tolerance is not None:
-        span = duration_for_tolerance(dt, steps, duration)
+        if dt is not None or steps is not None:
+            raise InputError("a tolerance chooses dt and steps: give duration and tolerance without them")
+        span = positive("duration", duration, "s")
         chosen = steps_for_tolerance(scene, q0, v0, span, tolerance, controls, integrator)
         integrator, steps, controls, accuracy, unmet, error = chosen
         dt = span / steps
