@@ -360,10 +360,9 @@ def _in_velocity(scene: Scene, q: Floats, fields: Fields, inverse: Floats) -> tu
 def _drift_derivatives(
     scene: Scene, trajectory: Trajectory, start: Floats, *, variational: bool
 ) -> tuple[Floats, Floats, Floats]:
-    """Derivatives of the drift in (q, p), or (q, v), (N, n, 2n) and in u (N, n, m), by differences of eighth order.
+    """Derivatives of the drift in the state (N, n, 2n), in u (N, n, m) and in a ramp of u, by differences.
 
-    The last ones (N, n, m) are those in a change of the control that grows linearly from 0 over the step. Differences,
-    as the drift alone needs second derivatives of diffusion fields, which noise classes do not provide.
+    The drift alone needs second derivatives of diffusion fields, which noise classes do not provide.
     """
     n, m, linear = scene.robot.dof, scene.controls, trajectory.u_nodes.shape[1] > 0
     found = np.zeros((trajectory.steps, n, 2 * (n + m)))

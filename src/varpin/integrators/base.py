@@ -40,12 +40,7 @@ _ARRAYS = ("q", "p", "v", "u", "energy")
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a rollout stopped before its end.
-
-    Attributes:
-        reason: The reason as text.
-        residual: The last residual, in units of its rounding error.
-    """
+    """Why a rollout stopped before its end, and its last residual, in units of the rounding error."""
 
     reason: str
     residual: float
@@ -387,10 +382,9 @@ def diffusion_and_drift(
 def noise_of_step(
     scene: Scene, F: Floats, q: Floats, v: Floats, ends: tuple[Floats, Floats], start: Floats, dw: Floats
 ) -> Floats:
-    """The impulse (n,) of increments dw (K,) at a state (q, v), by fields in Python.
+    """The impulse (n,) of increments dw (K,) at a state, by fields in Python, F (n, k) of the mean control.
 
-    ``F`` (n, k) are those of the mean control, ``ends`` (1, m) the controls at both ends of the step, ``start`` (n,)
-    the configuration at the start of the motion.
+    ``ends`` (1, m) are the controls at both ends of the step, ``start`` (n,) is the configuration at the motion's start.
     """
     k = scene.processes
     impulse: Floats = F @ dw[:k]

@@ -34,13 +34,7 @@ TOO_STEEP = "the adaptive method cannot go on: the motion runs away, or its tole
 
 @dataclass
 class ReferenceRun:
-    """State of a rollout.
-
-    Attributes:
-        x: (q, v) of each path (P, 2n).
-        dynamics: Forward dynamics at a single state.
-        tried: Length of the last internal step [s], the first trial of the next; 0 for none.
-    """
+    """State of a rollout: (q, v) of each path (P, 2n), forward dynamics, and the last internal step [s], 0 for none."""
 
     x: Floats
     dynamics: ForwardDynamics
@@ -84,11 +78,7 @@ class Reference(Integrator):
         return tuple(gauss_coefficients(_POINTS)[2].tolist())
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[ReferenceRun, list[Segment]]:
-        """See :meth:`Integrator.start`.
-
-        Raises:
-            InputError: The scene has noise.
-        """
+        """See :meth:`Integrator.start`."""
         refuse_constraints(scene, self)
         if scene.processes:
             raise InputError(f"{self} integrates no noise: leave it out of the scene")

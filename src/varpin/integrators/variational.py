@@ -184,11 +184,7 @@ class Variational(Compiled):
         return run, first_nodes(q, p, v, energy, scene.controls)
 
     def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
-        """See :meth:`Compiled.begun`.
-
-        Raises:
-            SingularMassMatrix: M(q0) is not positive definite.
-        """
+        """See :meth:`Compiled.begun`."""
         guards, places = self._guards(energy=not scene.inputs), self._places(scene) if scene.constraints else None
         method = scene.core, self._tableau(), float(self.tolerance), guards, self.left
         rollout = Rollout(*method, len(q0), self.holds_noise, places)
@@ -267,11 +263,7 @@ class Variational(Compiled):
         return Jx, Jf, Jr
 
     def _contract_by_differences(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
-        """:meth:`contract` under constraints, by differences of the gradients z' J with exact derivatives J.
-
-        Momenta and forces are scaled by the mass matrix to equal speeds, since heavy and light joints differ by orders
-        of magnitude.
-        """
+        """:meth:`contract` under constraints, by differences of z' J with exact derivatives J, scaled by M."""
         n, N = scene.robot.dof, trajectory.steps
         rates, cubic = _rates(scene, trajectory)
         wide = 3 * n + len(cubic)
@@ -347,10 +339,7 @@ class Variational(Compiled):
         }
 
     def _guess(self, trajectory: Trajectory) -> Floats:
-        """Initial stage velocities (N, s, n) for every step at dw = 0, from the cubic through both nodes.
-
-        With noise that step starts from another momentum, so the guess is the velocity at its start.
-        """
+        """Stage velocities (N, s, n) at dw = 0 from the cubic through both nodes; with noise, those at the starts."""
         v, moved, times = trajectory.v, np.diff(trajectory.q, axis=0), self._times()
         if trajectory.noisy:
             return np.repeat(v[:-1, None], len(times), axis=1)

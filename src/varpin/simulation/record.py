@@ -107,11 +107,7 @@ class MotionRecord:
     def advance(
         self, state: object, controls: Controls | ControlLaw, commands: Commands, most: int, steps: int
     ) -> Segment:
-        """Append about ``most`` steps on the way to ``steps`` in all; the arguments are those of :func:`next_block`.
-
-        Raises:
-            StepError: A user's function failed; the error has the motion so far.
-        """
+        """Append about ``most`` steps of ``steps`` in all; a StepError with the motion so far if a function failed."""
         try:
             block = next_block(controls, commands, self, most, steps - self.steps)
         except ControlError as error:
@@ -164,17 +160,10 @@ def trajectory_of(
     within: Floats | None,
     on: Commands | None = None,
 ) -> Trajectory:
-    """The motion from a first node through consecutive segments.
+    """The motion from a first node through consecutive segments; increments ``dw`` (N, k), None for zeros.
 
-    Args:
-        scene: The scene.
-        integrator: The integrator.
-        dt: Time step [s].
-        first: The first node.
-        parts: The segments.
-        dw: Increments (N, k) [s^0.5]; None for zeros.
-        within: Controls at the stages (N, s, m); None for controls that are constant over each step.
-        on: The commands of the whole motion, where its controls are linear between nodes.
+    ``within`` are the controls at the stages (N, s, m), None for constant ones; ``on`` the commands of the whole motion,
+    where its controls are linear between nodes.
     """
     steps = join(parts) if len(parts) > 1 else parts[0] if parts else first.part(0)
     N = len(steps.u)
@@ -253,17 +242,9 @@ def next_command(commands: Commands, record: MotionRecord) -> Commands:
 def next_block(
     controls: Controls | ControlLaw, commands: Commands, record: MotionRecord, most: int, left: int
 ) -> Commands:
-    """Commands of the next steps.
+    """Commands of about ``most`` next steps, whole intervals of held controls unless it is 1, of ``left`` in all.
 
-    Args:
-        controls: Of the motion.
-        commands: All commands, unless the controls are a function.
-        record: The steps so far.
-        most: About how many steps; whole intervals of held controls unless it is 1.
-        left: Steps to the end of the motion.
-
-    Raises:
-        ControlError: The function of the controls failed.
+    ``commands`` are those of the whole motion, unless the ``controls`` are a function: it may fail with a ControlError.
     """
     if callable(controls):
         decides = record.steps % commands.hold == 0
@@ -306,15 +287,10 @@ class Motions:
         increments: Floats | None = None,
         integrator: Integrator | None = None,
     ) -> tuple[Trajectory, Failure | None]:
-        """The motion, and the failure that stopped it early, if any. No argument is checked.
+        """The motion under commands of all its steps, unchecked, and the failure that stopped it early, if any.
 
-        Args:
-            commands: For all of its steps.
-            increments: Of its Wiener processes (N, k) [s^0.5]; left out, there is no noise.
-            integrator: The integrator with another guard; by default itself.
-
-        Raises:
-            ForceError: A function of a CustomForce failed; so for a ConstraintError.
+        ``increments`` are (N, k) [s^0.5], left out for no noise; ``integrator`` is the integrator with another guard. Raises
+        a ForceError or ConstraintError if a function failed.
         """
         drawn = np.zeros((0, 0, self.scene.processes)) if increments is None else increments[None]
         own = integrator or self.integrator

@@ -217,10 +217,7 @@ def _roll(
     *,
     check: bool,
 ) -> bool:
-    """Integrate the steps of a motion into its record; False if Ctrl-C ended them.
-
-    ``hold`` is the period of the feedback in steps, None for none.
-    """
+    """Integrate the steps of a motion with feedback every ``hold`` steps; False if Ctrl-C ended them."""
     scene = record.scene
     # The cost of a sweep is linear in the number of joints, that of an elimination cubic.
     n = scene.robot.dof

@@ -169,11 +169,7 @@ class Rung:
 
 
 class Ladder:
-    """Methods that are tried until one meets a wish.
-
-    Attributes:
-        rungs: The methods.
-    """
+    """Methods, ``rungs``, that are tried until one meets a wish."""
 
     def __init__(
         self,
@@ -183,15 +179,7 @@ class Ladder:
         rows: int,
         late: Callable[[], bool],
     ) -> None:
-        """A ladder without trials.
-
-        Args:
-            attempt: Tries a method with a number of steps.
-            integrators: The methods.
-            first: Number of steps of the first trials.
-            rows: All numbers of steps are multiples of it.
-            late: Whether no further trial may begin.
-        """
+        """A ladder that ``attempt``s integrators from ``first`` steps on, multiples of ``rows``, until ``late``."""
         self.attempt, self.late = attempt, late
         self.rungs = [Rung(member, first, rows) for member in integrators]
 
@@ -339,11 +327,7 @@ class _Search:
         return commands_of(self.scene, integrator, controls, steps, self.duration / steps)
 
     def attempt(self, integrator: Integrator, steps: int) -> Trial:
-        """A motion with its error, and the evaluations that it takes.
-
-        Raises:
-            VarpinError: A user's function has failed in all of many trials.
-        """
+        """A motion with its error and work; a VarpinError if a user's function has failed in all of many trials."""
         if steps > self.most:
             # Too long to run. Its cost is counted, which ends a search whose trials all fail in their first steps.
             self.evaluations += steps
@@ -387,16 +371,9 @@ def steps_for_tolerance(
     wanted: Controls | ControlLaw,
     integrator: Integrator | None,
 ) -> Chosen:
-    """Integrator, number of steps and controls for a tolerance, with the accuracy, the error and warnings.
+    """Integrator, number of steps and controls for a tolerance [rad or m], with the accuracy, the error and warnings.
 
-    Args:
-        scene: The scene, without noise.
-        q0: Initial configuration (n,) [rad or m].
-        v0: Initial velocity (n,) [rad/s or m/s].
-        duration: Of the motion [s].
-        tolerance: The largest error in q [rad or m].
-        wanted: The controls.
-        integrator: The only one to consider; None for all.
+    ``wanted`` are the controls, ``integrator`` is the only one to consider, None for all.
 
     Raises:
         InputError: The scene, the controls or the integrator are none that a tolerance can choose steps for.
