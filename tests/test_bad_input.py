@@ -507,7 +507,6 @@ def clear(robot, **options):
         (lambda r, s: vp.Midpoint(alpha=np.nan), ("alpha", "[0, 1]", "nan")),
         (lambda r, s: vp.Midpoint(alpha=None), ("alpha", "None")),
         (lambda r, s: vp.load_robot("ur5", lock=ARRAY), "lock"),
-        (lambda r, s: vp.Scene(r, constraints=[vp.KinematicInput(ARRAY)]), "KinematicInput"),
         (
             lambda r, s: vp.work_precision(vp.Scene(r), *REST, duration=0.1, integrators=3, dts=[0.01]),
             ("integrators", "3"),

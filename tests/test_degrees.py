@@ -109,33 +109,6 @@ def test_stops_in_degrees(caplog):
     assert all("looks like degrees" in sentence for sentence in told)
 
 
-def springs(scene, **given):
-    force = vp.FrameSpring("tool0", given.pop("b", [0.6, 0.2, 0.4]), 10.0, **given)
-    return vp.Scene(scene.robot, forces=force)
-
-
-@pytest.mark.parametrize(
-    ("make", "named"),
-    [
-        (lambda scene: vp.Scene(scene.robot, gravity=(0.0, 0.0, -9810.0)), ("9810 m/s^2", "mm/s^2")),
-        (lambda scene: springs(scene, rest=300.0), ("FrameSpring: rest", "300 m", "millimetres")),
-        (lambda scene: springs(scene, b=[600.0, 200.0, 400.0]), ("point b", "millimetres")),
-    ],
-)
-def test_millimetres_in_a_scene(scene, make, named):
-    """Told of with a motion, and first of a plan; the same in metres is not."""
-    q0, rest = np.deg2rad(HOME), np.zeros(6)
-    motion = vp.simulate(make(scene), q0, rest, dt=1e-4, steps=2)
-    assert not unnamed(motion.warnings[0], named)
-    cost = vp.ControlCost(1e-3)
-    problem = vp.OptimalControlProblem(make(scene), cost, q0, rest, dt=1e-4, steps=2)
-    assert not unnamed(vp.solve(problem, max_iterations=1).warnings[0], named)
-    for fine in (springs(scene, rest=0.3), vp.Scene(scene.robot, gravity=(0.0, 0.0, -1e4)), scene):
-        assert not any(
-            "mm" in told or "milli" in told for told in vp.simulate(fine, q0, rest, dt=1e-4, steps=2).warnings
-        )
-
-
 @pytest.mark.parametrize("scale", [1000.0, 1.0])
 @pytest.mark.parametrize(
     ("make", "named"),

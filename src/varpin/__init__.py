@@ -63,8 +63,6 @@ from varpin.mechanics.forces import JointDamper as JointDamper
 from varpin.mechanics.forces import JointSpring as JointSpring
 from varpin.mechanics.forces import JointStop as JointStop
 from varpin.mechanics.forces import PositionServo as PositionServo
-from varpin.mechanics.lagrangian import DiscreteLagrangian as DiscreteLagrangian
-from varpin.mechanics.lagrangian import LagrangianJet as LagrangianJet
 from varpin.mechanics.lagrangian import discrete_lagrangian as discrete_lagrangian
 from varpin.mechanics.lagrangian import lagrangian_jet as lagrangian_jet
 from varpin.mechanics.noise import AdditiveNoise as AdditiveNoise
@@ -91,6 +89,8 @@ from varpin.simulation.failures import NoiseError as NoiseError
 from varpin.simulation.failures import StepFailure as StepFailure
 from varpin.simulation.failures import ToleranceError as ToleranceError
 from varpin.simulation.simulate import simulate as simulate
+from varpin.textbook import DiscreteLagrangian as DiscreteLagrangian
+from varpin.textbook import LagrangianJet as LagrangianJet
 from varpin.trajectory import Accuracy as Accuracy
 from varpin.trajectory import Nodes as Nodes
 from varpin.trajectory import StepStatistics as StepStatistics

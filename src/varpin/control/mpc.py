@@ -28,14 +28,14 @@ from varpin.integrators.base import Failure
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.scene import Scene, closest_controls, require_scene
 from varpin.mechanics.wiener import generator, wiener_increments
-from varpin.signals.inputs import in_parts_of_steps, with_ends
+from varpin.signals.commands import in_parts_of_steps, with_ends
 from varpin.signals.policy import FirstOrderHold
 from varpin.simulation.check import check
 from varpin.simulation.choice import usual_integrator
 from varpin.simulation.failures import Interrupted, StepFailure
 from varpin.simulation.limits import beyond_limits
 from varpin.simulation.loop import unstable_loop
-from varpin.simulation.progress import Progress
+from varpin.simulation.record import Progress
 from varpin.simulation.simulate import noise_forgotten, simulate
 from varpin.support.checks import JointValues, control_values, count, positive, real, told_motion
 from varpin.support.frozen import Frozen

@@ -29,15 +29,13 @@ from varpin.control.costs import (
     control_rate,
     with_control_before,
 )
-from varpin.core import sample_steps
 from varpin.errors import InputError
 from varpin.finding import announce
 from varpin.integrators import Gauss, Integrator, Radau
 from varpin.integrators.registry import require_motion
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene, closest_controls, require_scene, same, tangent_basis
-from varpin.signals.commands import cubics
-from varpin.signals.inputs import as_moved
+from varpin.signals.commands import as_moved, cubics
 from varpin.signals.policy import LinearPolicy, OpenLoop
 from varpin.simulation.choice import usual_integrator, usual_kick
 from varpin.simulation.simulate import simulate
@@ -604,8 +602,13 @@ class OptimalControlProblem(Frozen):
         q and v (..., N s, n) and u (..., N s, m), from q and v at the nodes (..., N + 1, n) and u (..., N, m), or
         (..., N + 1, m) at the nodes where controls are linear between them.
         """
-        motions = (x.reshape(-1, *x.shape[-2:]) for x in (q, v))
-        at_q, at_v = (x.reshape(*q.shape[:-2], *x.shape[-2:]) for x in sample_steps(self.rule, *motions))
+        nodes = q[..., :-1, :], v[..., :-1, :], q[..., 1:, :], v[..., 1:, :]
+        shape = *q.shape[:-2], (q.shape[-2] - 1) * len(self.rule), q.shape[-1]
+        # A node without weight may be NaN.
+        at_q, at_v = (
+            np.stack([sum(w * x for w, x in zip(row, nodes, strict=True) if w) for row in rows], -2).reshape(shape)
+            for rows in (self.rule[:, 1:5], self.rule[:, 5:])
+        )
         if self.linear:
             share = self.places[:, None]
             between = (1.0 - share) * u[..., :-1, None, :] + share * u[..., 1:, None, :]
@@ -705,10 +708,7 @@ class OptimalControlProblem(Frozen):
 
     def expand_running(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the running costs along a motion, at their samples, in (q, v, u)."""
-        q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
-        if self.running.others or self.linear:
-            return self.running.expand(*self.samples(q, v, u))
-        return Expansion(*self.running.compiled.core.expand_steps(self.rule, q, v, u))
+        return self.running.expand(*self.samples(trajectory.q, trajectory.v, self.control_rows(trajectory)))
 
     @cached_property
     def places(self) -> Floats:

@@ -156,8 +156,8 @@ class Robot(Frozen):
         Raises:
             UnknownJoint: The robot has no such coordinate.
         """
-        if joint not in self.joint_names:
-            raise UnknownJoint(joint, self.joint_names, f"robot {self.name!r}")
+        if not isinstance(joint, str) or joint not in self.joint_names:
+            raise UnknownJoint(str(joint), self.joint_names, f"robot {self.name!r}")
         return self.joint_names.index(joint)
 
     @property
