@@ -6,6 +6,7 @@ Equation (O1) of docs/mathematics.md.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -428,6 +429,14 @@ class OptimalControlProblem(Frozen):
                 short = max(len(str(theirs)), len(str(mine))) <= _SHORT
                 return f"{name} = {theirs}, not {mine}" if short else f"different {name.replace('.', ' ')}"
         return ""
+
+    def mismatch(self, setting: Mapping[str, Any], trajectory: Trajectory, cost: float) -> str:
+        """Of which other problem a plan's :attr:`setting`, motion and cost are, in words; empty if of this one."""
+        if difference := self.differs(setting):
+            return f"of another problem: {difference}"
+        found = self.cost_of(trajectory)
+        close = math.isclose(found, cost, rel_tol=1e-9)
+        return "" if close else f"of a problem with another cost: {cost:.9g}, and here {found:.9g}"
 
     def constraints_on(
         self, dt: float, steps: int, hold: int, *, linear: bool | None = None
