@@ -606,18 +606,9 @@ class OptimalControlProblem(Frozen):
         causes no rounding error.
         """
         q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
-        return self.shares_along(q, v, u, self.running.compiled.values(*self.samples(q, v, u)))
-
-    def shares_along(self, q: Floats, v: Floats, u: Floats, compiled: Floats) -> Floats:
-        """:meth:`shares` of a motion, q and v (N + 1, n) and u (N, m), or (N + 1, m) at the nodes.
-
-        ``compiled`` are values of the running terms that the core evaluates, at all samples (N s, terms).
-        """
-        weight = self.dt * self.rule[0, 0]
-        found = [weight * compiled.ravel()]
-        if self.running.others:
-            at = self.samples(q, v, u)
-            found += [weight * (factor * part.value(*at)) for factor, part in self.running.others]
+        at, weight = self.samples(q, v, u), self.dt * self.rule[0, 0]
+        found = [weight * self.running.compiled.values(*at).ravel()]
+        found += [weight * (factor * part.value(*at)) for factor, part in self.running.others]
         found += [values.ravel() for values in self.terminal.shares(q[-1:], v[-1:], np.zeros((1, u.shape[1])))]
         if self.rate is not None:
             found.append(self.rate.shares(u[:: self.hold], self.period))
