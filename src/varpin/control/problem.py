@@ -47,7 +47,6 @@ from varpin.support.checks import (
     flag,
     joint_array,
     named_limits,
-    positive,
     tuple_of,
     word,
 )
@@ -331,14 +330,10 @@ class OptimalControlProblem(Frozen):
                 neither cost nor limit; or as for the problem itself.
         """
         if before is not None and not self.remembers:
-            raise InputError(
-                "before is the control that a ControlRateCost or a WithinControlRate begins with: give one"
-            )
+            raise InputError("before is what a ControlRateCost or a WithinControlRate begins with: give one")
         if dt is not None and steps is None and duration is None:
-            steps = round(self.duration / positive("dt", dt, "s"))
-            if abs(steps * dt - self.duration) > 1e-9 * self.duration:
-                raise InputError(f"the horizon of {self.duration:g} s is no multiple of dt = {dt:g} s")
-        elif duration is not None:
+            duration = self.duration
+        if duration is not None:
             dt, steps = time_steps(self.dt if dt is None and steps is None else dt, steps, duration)
         moved: dict[str, Any] = {"q0": q0, "v0": v0, "t0": t0}
         grid: dict[str, Any] = {"dt": dt, "steps": steps, "integrator": integrator, "sampling": sampling, "hold": hold}
@@ -392,6 +387,7 @@ class OptimalControlProblem(Frozen):
             steps=steps,
             hold=1 if self.linear else self.hold * parts,
             sampling="gauss",
+            places=places,
             rule=rule,
             running=running,
             terminal=terminal,
