@@ -8,8 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.costs.base import BoundCost, Cost, CostSum, Points
-from varpin.control.costs.least_squares import LeastSquares, checked_weight, plain, weight_matrix
+from varpin.control.costs.base import (
+    BoundCost,
+    Cost,
+    CostSum,
+    LeastSquares,
+    Points,
+    checked_weight,
+    plain,
+    weight_matrix,
+)
 from varpin.core import change_values, expand_changes
 from varpin.errors import InputError
 from varpin.support.checks import JointValues, as_floats, control_array, control_values
