@@ -196,21 +196,6 @@ def test_mpc_joins_its_plans():
     np.testing.assert_array_equal(free.plans[1].problem.rate.before, free.motion.u[0])
 
 
-def test_the_last_decision_of_a_late_plan_expects_itself_before():
-    """A plan that is held beyond its end repeats its last decision where not every joint can be driven to rest."""
-    one_way = [[1.0, 0.4], [0.5, 0.2]]
-    problem = linear(vp.ControlRateCost(MATRIX, BEFORE), integrator=vp.RungeKutta4(), steps=6, actuation=one_way)
-    ran = vp.Mpc(problem, budget=1e-9).run(
-        vp.Plant(problem.scene, integrator=vp.RungeKutta4(), substeps=1), duration=0.5
-    )
-    plan = ran.plans[0].policy_on("velocity")
-    x = np.hstack([ran.motion.q, ran.motion.v])
-    for tick in range(6, 10):
-        own = plan.u[5] + plan.gains[5] @ (x[tick] - plan.reference[5])
-        expected = own + plan.previous_gains[5] @ (ran.motion.u[tick - 1] - plan.u[5])
-        np.testing.assert_allclose(ran.motion.u[tick], expected, rtol=0, atol=1e-12)
-
-
 class Wrapped(vp.Cost):
     def bind(self, points):
         return vp.ControlRateCost(1.0).bind(points)

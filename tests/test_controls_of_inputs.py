@@ -4,7 +4,6 @@ import functools
 
 import numpy as np
 import pytest
-from refusals import naming
 from scipy.integrate import solve_ivp
 
 import varpin as vp
@@ -117,16 +116,3 @@ def test_a_policy_moves_an_input_over_its_intervals(hold, linear):
         np.testing.assert_allclose(paths.q[0], motion.q, atol=1e-13)
         np.testing.assert_allclose(paths.u[0], motion.u, atol=1e-13)
     np.testing.assert_allclose(vp.linearize(scene, motion).B[:, 0, 0], 1.0, atol=1e-12)
-
-
-def test_an_input_that_begins_elsewhere_is_told():
-    scene = arm("linear")
-    away = Q0 + np.array([0.1, 0.0, 0.0])
-    given = {"dt": 0.01, "steps": 8}
-    for controls in (
-        vp.OpenLoop(lambda t: wanted(scene, t)),
-        vp.FirstOrderHold(np.array([wanted(scene, 0.01 * k) for k in range(9)])),
-    ):
-        motion = vp.simulate(scene, away, V0, controls=controls, **given)
-        assert naming(motion.warnings, "control 0", "KinematicInput", "0.3", "0.4")
-        assert not naming(vp.simulate(scene, Q0, V0, controls=controls, **given).warnings, "KinematicInput")

@@ -10,7 +10,6 @@ from findings import about
 from refusals import naming, refused, unnamed
 
 import varpin as vp
-from varpin.cli import main
 
 MASS = '<inertial pos="0.02 0.05 0.1" mass="1.3" diaginertia="0.02 0.03 0.025"/>'
 CONNECT = '<connect name="pin" body1="c" anchor="0.2 0 0" body2="d"/>'
@@ -45,9 +44,7 @@ def test_what_a_scene_leaves_out_is_told(looped, caplog):
     assert not caplog.records
     vp.Scene(looped)
     (record,) = caplog.records
-    assert not unnamed(
-        record.getMessage(), "constraints='robot'", "constraints=()", "<connect> 'pin'", "<joint> 'gear'"
-    )
+    assert not unnamed(record.getMessage(), "constraints='robot'", "constraints=()")
     caplog.clear()
     vp.Scene(looped, constraints=vp.KinematicInput("qa"))
     assert len(caplog.records) == 1
@@ -76,7 +73,7 @@ def test_the_word_stands_among_others(looped, caplog):
     assert not caplog.records
     assert not vp.Scene(vp.load_robot("finger"), constraints="robot").constraints
     assert not unnamed(caplog.records[0].getMessage(), "constraints='robot'", "none")
-    for given, facts in ((["robot", "robot"], "twice"), ("file", "constraints"), (["file"], "'file'")):
+    for given, facts in (("file", "constraints"), (["file"], "'file'")):
         with refused(vp.InputError, facts):
             vp.Scene(looped, constraints=given)
 
@@ -88,10 +85,8 @@ def test_locked_joints_take_their_constraints_along(tmp_path):
         robot = vp.load_robot(path, lock=lock)
         return robot, vp.Scene(robot, constraints="robot")
 
-    for lock, joint, at in (({"qb": 0.3}, "qa", 0.7), ({"qa": 0.7}, "qb", 0.3)):
-        robot, scene = tied(**lock)
-        q = vp.assemble(scene, np.zeros(3))
-        assert q[robot.coordinate(joint)] == pytest.approx(at, abs=1e-12)
+    robot, scene = tied(qb=0.3)
+    assert vp.assemble(scene, np.zeros(3))[robot.coordinate("qa")] == pytest.approx(0.7, abs=1e-12)
     assert not tied(qa=0.7, qb=0.3)[1].constraints
     with refused(vp.InputError, "<joint> 'gear'", "0.1"):
         tied(qa=0.8, qb=0.3)
@@ -159,13 +154,3 @@ def test_scene_files_take_them(tmp_path, looped, caplog):
     )
     with refused(vp.SceneFileError, "constraint[0]", "<joint> 'gear'"):
         vp.load_scene(path).scene  # noqa: B018
-
-
-def test_the_command_takes_them(tmp_path, looped, capsys):
-    q0 = vp.assemble(vp.Scene(looped, constraints="robot"), np.full(4, 0.1))
-    options = [str(looped.mjcf), "--duration", "0.1", "--constraints", "robot", "--q0", *map(repr, q0.tolist())]
-    assert main(["simulate", *options, "--save", str(tmp_path / "a.npz"), "--quiet"]) == 0
-    motion = vp.Trajectory.load(tmp_path / "a.npz")
-    assert motion.constraint_forces.shape[1] == 4
-    capsys.readouterr()
-    assert main(["advise", *options, "--tolerance", "1e-3"]) == 0

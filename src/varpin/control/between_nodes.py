@@ -408,11 +408,11 @@ def watched(problem: OptimalControlProblem) -> list[bool]:
 
 
 def middles(problem: OptimalControlProblem) -> Instants:
-    """The middles of all steps, for each constraint that may have rows there; none where controls are held.
+    """The middles of all steps, for each constraint that has rows between nodes.
 
     Linear controls can alternate, so that a motion keeps to constraints at its nodes and nowhere else.
     """
-    of = [i for i, may in enumerate(watched(problem)) if may and problem.linear]
+    of = [i for i, may in enumerate(watched(problem)) if may and (problem.linear or problem.between_nodes)]
     if not of:
         return NOWHERE
     rows = np.array([(i, step, 0) for i in of for step in range(problem.steps)])

@@ -100,9 +100,9 @@ class SearchState:
         first: Cost at stake on the first motion; -1 before it is known.
         counts: How often margins have been widened by counting motions.
         since: The first iteration from which on rows and margins stay.
-        rounds: How often margins have followed the motion of a search that ended, since then.
         second_order: Whether it uses second derivatives of the steps.
         iterations: Number of entries of the history that were made before.
+        rounds: How often margins have followed the motion of a search that ended, since then.
     """
 
     weight: float
@@ -111,9 +111,9 @@ class SearchState:
     first: float
     counts: int
     since: int
-    rounds: int
     second_order: bool
     iterations: int
+    rounds: int = 0
 
 
 def part(loss: float) -> str:

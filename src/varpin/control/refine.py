@@ -14,7 +14,7 @@ from varpin.control.history import Refined, Refinement, Status, part
 from varpin.control.multipliers import FEASIBLE, REPORTED
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
-from varpin.control.verification import excess, true_costs
+from varpin.control.verification import excess, on_robot
 from varpin.errors import VarpinError
 from varpin.trajectory import Trajectory
 
@@ -22,6 +22,10 @@ logger = logging.getLogger(__name__)
 
 # Tolerance of the searches, accuracy of true costs and change of the cost that does not count, relative to the wish.
 SUFFICIENT, _KNOWN = 0.01, 0.1
+# A loss is far above a wish from this multiple of it on: no accurate cost is needed.
+_FAR = 2.0
+# Least number of parts of a step in which constraints are looked at: motions are seen at the ends of parts only.
+_LOOKS = 8
 # Greatest number of halvings of the step.
 _HALVINGS = 10
 # Greatest violation of a constraint on the continuous system, relative to its range.
@@ -63,15 +67,21 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
             if solution.status is Status.INTERRUPTED:
                 best = best or _Best((9, 0.0), solution, 0, "")
                 raise KeyboardInterrupt
-            plan = problem, solution.trajectory, solution.cost, solution.policy_on
-            found = true_costs(*plan, wish=wish, accuracy=_KNOWN * wish)
+            found = on_robot(
+                problem,
+                solution.trajectory,
+                solution.policy_on,
+                tolerance=_KNOWN * wish,
+                above=solution.cost + _FAR * wish * abs(solution.cost),
+                substeps=_LOOKS if problem.constraints else 2,
+            )
             row = Refined(
                 dt=problem.dt,
                 steps=problem.steps,
                 cost=solution.cost,
-                true_cost=found.closed,
-                open_loop_cost=found.opened,
-                loss=excess(found.closed, solution.cost) if found.known else np.nan,
+                true_cost=found.closed.cost,
+                open_loop_cost=found.opened.cost,
+                loss=excess(found.closed.cost, solution.cost) if found.known else np.nan,
                 iterations=solution.iterations,
                 status=solution.status,
                 seconds=time.perf_counter() - began,
@@ -81,7 +91,7 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
             kind, value = _failing(row, solution, wish)
             rank = kind, value if kind else row.true_cost
             if best is None or rank < best.rank:
-                best = _Best(rank, solution, len(tried) - 1, found.where if kind >= 2 else "")
+                best = _Best(rank, solution, len(tried) - 1, found.beyond if kind >= 2 else "")
             finer, ended = None, _ended(tried, best.chosen, solution, time_left())
             doing = f"with half of dt = {problem.dt:g} s"
             half, fails = _halved(problem)

@@ -126,13 +126,12 @@ def foreseen(steps: Steps, plan: Plan) -> tuple[Floats, bool]:
     Also whether a control reaches a limit.
     """
     problem, given = steps.problem, steps.recursion(None, None)
-    (S, X, Z), layout = given.J.shape, Layout.of(problem)
+    (S, X, _), layout = given.J.shape, Layout.of(problem)
     R, m = plan.feedforward.shape
     A, B = (np.ascontiguousarray(part) for part in (given.J[:, :, :X], given.J[:, :, X:]))
     slack = steps.slack if problem.limited else np.zeros((0, 2, m))
-    expected, moves, after = np.empty((R, Z)), np.empty((R, m)), np.empty((S, X))
-    fixed = plan.feedforward, plan.gains, slack
-    limited = core.foresee(problem.hold, A, B, *fixed, np.zeros(Z), expected, moves, after)
+    moves, after = np.empty((R, m)), np.empty((S, X))
+    limited = core.foresee(problem.hold, A, B, plan.feedforward, plan.gains, slack, moves, after)
     x = np.vstack([np.zeros((1, layout.states)), after[:, : layout.states]])
     return layout.joined(x[-layout.stages - 1 :], moves), limited
 

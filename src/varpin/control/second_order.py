@@ -11,7 +11,7 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.control.stages import Steps, in_step
 from varpin.linearization import linearize_steps, node_jets, second_order_steps, velocity_curvature
 from varpin.mechanics.scene import quiet
-from varpin.signals.inputs import with_ends
+from varpin.signals.commands import with_ends
 from varpin.trajectory import Trajectory
 
 # Changes of velocities [rad/s or m/s] between the points of differences in controls.

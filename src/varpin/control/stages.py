@@ -19,7 +19,6 @@ from varpin.control.constraints import BoundConstraint, BoundRate
 from varpin.control.costs import CostError, Expansion
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.samples import after_impulse, at_samples, beyond_samples
-from varpin.core import stake_of
 from varpin.linearization import Linearization, linearize_steps, velocity_at_nodes
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
@@ -54,6 +53,25 @@ class Stake(NamedTuple):
 
     free: float  # decrease of the quadratic models if all were free; infinite without a minimum, zero at the least cost
     moved: float  # each bounded by its change over the motion's displacement: tolerances are relative to it
+
+
+def _stakes(model: Expansion, displacement: Floats) -> tuple[float, float]:
+    """The sums of :class:`Stake` over quadratic models, along displacements (N, k) of their variables."""
+    gradient, hessian = model.gradient, model.hessian
+    bend = np.diagonal(hessian, axis1=1, axis2=2) + np.zeros_like(gradient)
+    # Steepest descent, scaled by the diagonal: exact where no variables are coupled.
+    step = np.divide(gradient, bend, out=np.zeros_like(gradient), where=bend > 0.0)
+    slope, curvature = (gradient * step).sum(axis=1), _form(hessian, step)
+    endless = ((gradient != 0.0) & ~(bend > 0.0)).any(axis=1) | ((slope > 0.0) & ~(curvature > 0.0))
+    fall = np.where(endless, np.inf, 0.5 * slope**2 / np.where(curvature > 0.0, curvature, 1.0))
+    bound = np.maximum(0.5 * _form(hessian, displacement), 0.0)
+    return float(fall.sum()), float(np.minimum(bound, fall).sum())
+
+
+def _form(hessian: Floats, z: Floats) -> Floats:
+    """Z' H z (N,)."""
+    form: Floats = (np.matmul(z[:, None, :], hessian)[:, 0] * z).sum(axis=1)
+    return form
 
 
 class Terminal(NamedTuple):
@@ -294,7 +312,7 @@ class Steps:
         for factor, expansion, z in self._models:
             change = z.copy()
             change[:, : len(start)] -= start
-            could, does = stake_of(expansion.gradient, expansion.hessian, change)
+            could, does = _stakes(expansion, change)
             free, moved = free + factor * could, moved + factor * does
         if self.problem.rate is not None:
             rate = float(self.problem.rate.value(self.problem.decided(self.trajectory), self.problem.period))

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.finding import Finding
+from varpin.io.archive import Axes, read_npz, record_of, save_npz
+from varpin.support.checks import path_like
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, table, warning_count
+
+FORMAT = "varpin.ensemble/1"
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,14 +37,14 @@ class EnsembleStatistics(Frozen):
         count: Number of paths at each node (N + 1,): those that have not failed before.
     """
 
-    mean: Floats
-    covariance: Floats
-    levels: Floats
-    quantiles: Floats
+    mean: Annotated[Floats, Axes("nodes", "states")]
+    covariance: Annotated[Floats, Axes("nodes", "states", "states")]
+    levels: Annotated[Floats, Axes("levels")]
+    quantiles: Annotated[Floats, Axes("levels", "nodes", "states")]
     quantile_paths: int
-    energy_mean: Floats
-    energy_deviation: Floats
-    count: NDArray[np.int64]
+    energy_mean: Annotated[Floats, Axes("nodes")]
+    energy_deviation: Annotated[Floats, Axes("nodes")]
+    count: Annotated[NDArray[np.int64], Axes("nodes")]
 
     def __repr__(self) -> str:
         nodes, states = self.mean.shape
@@ -78,16 +85,34 @@ class Ensemble(Frozen):
         integrator: The integrator of all paths.
     """
 
-    t: Floats
+    t: Annotated[Floats, Axes("nodes", finite=True)]
     statistics: EnsembleStatistics
-    q: Floats | None
-    v: Floats | None
-    p: Floats | None
-    u: Floats | None
-    energy: Floats | None
-    failures: tuple[PathFailure, ...]
+    q: Annotated[Floats, Axes("paths", "nodes", "joints")] | None = None
+    v: Annotated[Floats, Axes("paths", "nodes", "joints")] | None = None
+    p: Annotated[Floats, Axes("paths", "nodes", "joints")] | None = None
+    u: Annotated[Floats, Axes("paths", "steps", "controls")] | None = None
+    energy: Annotated[Floats, Axes("paths", "nodes")] | None = None
+    failures: tuple[PathFailure, ...] = ()
     warnings: tuple[Finding, ...] = ()
     integrator: str = ""
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the ensemble as a compressed npz file without pickle; returns its path.
+
+        Raises:
+            FileError: The path cannot be written.
+        """
+        return save_npz(path, FORMAT, self)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Ensemble:
+        """Read an ensemble that :meth:`save` wrote.
+
+        Raises:
+            FileError: The file is missing, truncated, not npz or not an ensemble, or has inconsistent arrays.
+        """
+        source = path_like("path", path)
+        return record_of(cls, read_npz(source, FORMAT), source)
 
     def __repr__(self) -> str:
         return f"Ensemble({self._size()}{warning_count(self.warnings)})"

@@ -16,7 +16,7 @@ import secrets
 import socket
 import typing
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from types import NoneType, UnionType
@@ -183,6 +183,8 @@ def members_of(record: Any, prefix: str = "") -> dict[str, Any]:
             continue
         if is_dataclass(value):
             members |= members_of(value, f"{name}.")
+        elif (row := _row(hint)) is not None:
+            members |= {f"{name}.{own.name}": np.array([getattr(each, own.name) for each in value]) for own in row}
         elif isinstance(value, Mapping):
             members |= {f"{name}.{key}": array for key, array in value.items()}
         else:
@@ -240,7 +242,7 @@ class _Builder:
                 tables[key] = self.tables(hint, members, f"{name}.")
             elif name in entries:
                 tables[key] = entries[name]
-            elif typing.get_origin(hint) is Mapping:
+            elif typing.get_origin(hint) is Mapping or below:
                 tables[key] = below
         return tables
 
@@ -301,6 +303,10 @@ class _Builder:
 
     def _tuple(self, hint: Any, value: Any, entry: str) -> tuple[Any, ...]:
         kinds = typing.get_args(hint)
+        if isinstance(value, dict):
+            # Records, by columns.
+            columns = {name: np.asarray(column).tolist() for name, column in value.items()}
+            value = [dict(zip(columns, each, strict=True)) for each in zip(*columns.values(), strict=True)]
         if not isinstance(value, list) or (kinds[-1] is not ... and len(value) != len(kinds)):
             raise self.error(entry, reprlib.repr(value), "a list" if kinds[-1] is ... else f"a list of {len(kinds)}")
         wanted = [kinds[0]] * len(value) if kinds[-1] is ... else kinds
@@ -338,6 +344,12 @@ def _required(hint: Any) -> Any:
 def _texts(hint: Any) -> bool:
     """Whether an annotation is ``tuple[str, ...]``, or of findings."""
     return typing.get_origin(hint) is tuple and typing.get_args(hint)[0] in (str, Finding)
+
+
+def _row(hint: Any) -> Sequence[Any] | None:
+    """The fields of the records in an annotation ``tuple[record, ...]``; None of others."""
+    kinds = typing.get_args(hint) if typing.get_origin(hint) is tuple else (None,)
+    return fields(kinds[0]) if is_dataclass(kinds[0]) else None
 
 
 def _text(value: str) -> str:

@@ -18,7 +18,6 @@ from varpin.control.costs.base import (
     plain,
     weight_matrix,
 )
-from varpin.core import change_values, expand_changes
 from varpin.errors import InputError
 from varpin.support.checks import JointValues, as_floats, control_array, control_values
 from varpin.support.frozen import Frozen
@@ -79,8 +78,9 @@ class ControlRate(Frozen):
 
     def shares(self, u: Floats, period: float) -> Floats:
         """Costs (..., N) of the changes to each of N controls (..., N, m) that change every ``period`` [s]."""
-        rows = np.ascontiguousarray(u).reshape(-1, *u.shape[-2:])
-        return change_values(self.weight / period, self._before, rows).reshape(u.shape[:-1])
+        changes = self._changes(u)
+        shares: Floats = ((changes @ (self.weight / period)) * changes).sum(axis=-1)
+        return shares
 
     def value(self, u: Floats, period: float) -> Floats:
         """The cost (...) of controls (..., N, m) that change every ``period`` [s]."""
@@ -89,12 +89,16 @@ class ControlRate(Frozen):
 
     def expand(self, u: Floats, period: float) -> tuple[Floats, Floats]:
         """Gradients (N, m) and Hessians (N, m, m) in u_k of the cost of each change, at controls (N, m)."""
-        return expand_changes(self.weight / period, self._before, np.ascontiguousarray(u))
+        hessian = np.tile(2.0 * self.weight / period, (len(u), 1, 1))
+        if self.before is None:
+            hessian[:1] = 0.0
+        return 2.0 * self._changes(u) @ (self.weight / period), hessian
 
-    @property
-    def _before(self) -> Floats:
-        """(1, m), or (0, m) where the first control is free."""
-        return np.zeros((0, len(self.weight))) if self.before is None else self.before[None]
+    def _changes(self, u: Floats) -> Floats:
+        """The change to each control (..., N, m); none to a first one that is free."""
+        first = u[..., :1, :]
+        changes: Floats = np.diff(u, axis=-2, prepend=first if self.before is None else first * 0.0 + self.before)
+        return changes
 
 
 def control_rate(cost: Cost, controls: int, joints: Sequence[str] | None = None) -> ControlRate | None:
