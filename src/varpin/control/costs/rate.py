@@ -66,7 +66,7 @@ class ControlRateCost(LeastSquares):
 
 @dataclass(frozen=True, eq=False)
 class ControlRate(Frozen):
-    """The total cost of control changes.
+    """The total cost of control changes, (O5).
 
     Attributes:
         weight: (m, m).
