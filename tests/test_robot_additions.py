@@ -6,7 +6,6 @@ import pytest
 from refusals import refused
 
 import varpin as vp
-from varpin.cli import main
 from varpin.model.robot import geometry
 
 PLACE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.5, 1.1), np.array([0.4, -2.0, 0.7]))
@@ -230,22 +229,3 @@ class TestElsewhere:
         path.write_text(text.replace("BASE", '"round"'))
         with refused(vp.SceneFileError, "robot.base"):
             vp.load_scene(path)
-
-    def test_on_the_command_line(self, tmp_path):
-        out = tmp_path / "fall.npz"
-        words = [
-            "simulate",
-            "ur5",
-            "--base",
-            "planar",
-            "--armature",
-            "elbow_joint=0.4",
-            "--steps",
-            "3",
-            "--save",
-            str(out),
-        ]
-        assert main(words) == 0
-        motion = vp.Trajectory.load(out)
-        assert motion.joint_names[:3] == ("base_x", "base_y", "base_turn")
-        assert motion.scene_values["armature"][5] == 0.4

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.finding import Finding
+from varpin.io.archive import read_npz, record_of, save_npz
+from varpin.support.checks import path_like
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, table, warning_count
+
+FORMAT = "varpin.ensemble/1"
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,14 +86,32 @@ class Ensemble(Frozen):
 
     t: Floats
     statistics: EnsembleStatistics
-    q: Floats | None
-    v: Floats | None
-    p: Floats | None
-    u: Floats | None
-    energy: Floats | None
-    failures: tuple[PathFailure, ...]
+    q: Floats | None = None
+    v: Floats | None = None
+    p: Floats | None = None
+    u: Floats | None = None
+    energy: Floats | None = None
+    failures: tuple[PathFailure, ...] = ()
     warnings: tuple[Finding, ...] = ()
     integrator: str = ""
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the ensemble as a compressed npz file without pickle; returns its path.
+
+        Raises:
+            FileError: The path cannot be written.
+        """
+        return save_npz(path, FORMAT, self)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Ensemble:
+        """Read an ensemble that :meth:`save` wrote.
+
+        Raises:
+            FileError: The file is missing, truncated, not npz or not an ensemble, or has arrays of other types.
+        """
+        source = path_like("path", path)
+        return record_of(cls, read_npz(source, FORMAT), source)
 
     def __repr__(self) -> str:
         return f"Ensemble({self._size()}{warning_count(self.warnings)})"

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
+import json
 import os
 import reprlib
 import secrets
@@ -284,6 +285,9 @@ class _Builder:
         return whole
 
     def _record(self, kind: Any, value: Any, entry: str) -> Any:
+        if isinstance(value, str):
+            with contextlib.suppress(ValueError):
+                value = json.loads(value)
         if not isinstance(value, dict):
             raise self.error(entry, reprlib.repr(value), "a table")
         hints, given = _hints(kind), {}
@@ -336,13 +340,16 @@ def _required(hint: Any) -> Any:
 
 
 def _texts(hint: Any) -> bool:
-    """Whether an annotation is ``tuple[str, ...]``, or of findings."""
-    return typing.get_origin(hint) is tuple and typing.get_args(hint)[0] in (str, Finding)
+    """Whether an annotation is a tuple of texts, findings or records, which are texts in files."""
+    first = typing.get_args(hint)[0] if typing.get_origin(hint) is tuple else None
+    return first in (str, Finding) or is_dataclass(first)
 
 
-def _text(value: str) -> str:
-    """A text, or a finding with its numbers, as one string."""
-    return value.entry() if isinstance(value, Finding) else value
+def _text(value: Any) -> str:
+    """A text; a finding with its numbers, and a record of plain values, as JSON."""
+    if is_dataclass(value):
+        return json.dumps(vars(value))
+    return value.entry() if isinstance(value, Finding) else str(value)
 
 
 def _array_type(hint: Any) -> tuple[np.dtype[Any], Axes | None]:

@@ -80,11 +80,6 @@ class SceneFile:
         """The robot, without the joints that are left out."""
         return self.scene.robot
 
-    @property
-    def driven(self) -> bool:
-        """Whether anything but gravity and springs acts in a simulation."""
-        return not self.scene.conservative or self._task.controls is not None or self._seed is not None
-
     @cached_property
     def integrator(self) -> Integrator:
         """The integrator of the file.
