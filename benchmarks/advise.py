@@ -25,7 +25,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
 import varpin as vp
-from varpin.simulation.ladder import INTEGRATORS
+from varpin.simulation.tolerance import INTEGRATORS
 from varpin.study.motion import Setting
 
 ROBOTS = ("finger", "ur5", "xarm7", "talos_arm", "z1", "chain2", "chain3", "chain5", "chain7")

@@ -15,7 +15,7 @@ from refusals import refused
 import varpin as vp
 from varpin.control.costs import BoundCost, Cost, Expansion
 from varpin.core.arrays import Diffusion
-from varpin.mechanics.noise import CompiledFields, Noise
+from varpin.mechanics.noise import BoundNoise, Noise
 
 ROBOT = vp.planar_chain(2)
 SCENE = vp.Scene(ROBOT)
@@ -148,9 +148,9 @@ class TestTheCoreGetsWhatFits:
     @pytest.mark.parametrize("value", [np.zeros((1, 1)), np.zeros((9, 9)), None, np.full((2, 2), np.inf, dtype="f4")])
     def test_noise_of_one_s_own(self, field, value):
         class Own(Noise):
-            def bind(self, actuation):
+            def bind(self, actuation, joints):
                 fields = Diffusion(np.zeros((2, 2)), np.zeros((2, 2, 2)), np.zeros((2, 2)), np.zeros((2, 2)))
-                return CompiledFields(fields._replace(**{field: value}))
+                return BoundNoise(fields._replace(**{field: value}))
 
         with pytest.raises((vp.InputError, AttributeError)) as info:
             vp.Scene(ROBOT, noise=Own())

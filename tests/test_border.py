@@ -185,19 +185,11 @@ def calls():
     costs = cost_terms(made, n, m)
     for name, call in (("cost values", costs.values), ("cost expansions", costs.expand)):
         yield name, call, {**states, "u": draw(N, m)}
-    changes = {"weight": np.eye(m), "before": draw(1, m)}
-    yield "changes", core.change_values, {**changes, "u": draw(P, N, m)}
-    yield "expanded changes", core.expand_changes, {**changes, "u": draw(N, m)}
-    models = {"gradient": draw(N, m), "hessian": draw(N, m, m), "displacement": draw(N, m)}
-    yield "stake", core.stake_of, models
 
 
-# Sizes that are the caller's to choose: rows of what is done one by one, a control before that may be left out.
-FREE = {("place a frame", "q", 0), ("changes", "u", 0), ("changes", "u", 1), ("expanded changes", "u", 0)}
-FREE |= {("constraints", "q", 0)}
-FREE |= {("changes", "before", 0), ("expanded changes", "before", 0)}
+# Sizes that are the caller's to choose: rows of what is done one by one.
 # Of two stages: a force for each.
-FREE |= {("steps", "force", 1)}
+FREE = {("place a frame", "q", 0), ("constraints", "q", 0), ("steps", "force", 1)}
 
 
 @pytest.fixture(scope="module")

@@ -574,10 +574,3 @@ def test_a_blow_within_a_step_is_held_against_the_limit_of_efforts():
     (told,) = about(motion.warnings, "effort limits")
     assert told.value == pytest.approx(400.0 - scene.robot.effort_limit[1])
     assert told.time == pytest.approx(0.1)
-
-
-def test_breaks_outside_the_motion():
-    def told(*breaks):
-        return about(moved(FREE, controls=vp.OpenLoop(lambda t: np.ones(3), breaks=breaks)).warnings, "breaks outside")
-
-    assert [len(told(*breaks)) for breaks in ((), (100, 102), (100, 0.1), (-1.0,))] == [0, 1, 0, 1]

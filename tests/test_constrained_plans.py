@@ -193,23 +193,6 @@ def test_plans_keep_torque_limits_and_gradients_are_those_of_the_rollout():
         assert there.gradient[k, c] == pytest.approx((costs[0] - costs[1]) / 2e-3, rel=1e-6)
 
 
-def test_holding_controls_leave_a_closed_loop_at_rest():
-    scene, q0 = five_bar()
-    u = scene.holding_controls(q0)
-    motion = vp.simulate(scene, q0, np.zeros(4), dt=0.01, steps=5, controls=u)
-    np.testing.assert_allclose(motion.q, np.broadcast_to(q0, (6, 4)), atol=1e-12)
-    torque = scene.holding_torque(q0)
-    assert np.linalg.norm(torque) < np.linalg.norm(scene.actuation @ u)
-    every = vp.Scene(scene.robot, constraints=scene.constraints)
-    motion = vp.simulate(every, q0, np.zeros(4), dt=0.01, steps=5, controls=torque)
-    np.testing.assert_allclose(motion.q, np.broadcast_to(q0, (6, 4)), atol=1e-12)
-    with refused(vp.InputError, "q", "PointOnPoint", "assemble"):
-        scene.holding_torque(q0 + 0.1)
-    one = vp.Scene(scene.robot, constraints=scene.constraints, actuation=scene.actuation[:, :1])
-    with refused(vp.InputError, "robot", "hold"):
-        one.holding_controls(q0)
-
-
 def test_plans_begin_on_the_constraints(caplog):
     scene, q0 = five_bar()
     cost = vp.ControlCost(1.0)
@@ -269,14 +252,6 @@ def test_an_ensemble_under_a_plan_is_what_its_model_says():
         rng=child,
     )
     np.testing.assert_array_equal(again.q[0], single.q)
-
-
-def test_paths_may_begin_at_different_places_along_the_constraints(caplog):
-    scene, q0 = five_bar(noise=vp.AdditiveNoise(0.05))
-    starts = np.array([q0, q0 + 1e-3])
-    found = vp.simulate_ensemble(scene, starts, np.zeros(4), dt=0.01, steps=3, paths=2, rng=0)
-    assert naming(caplog.messages, "path 1", "q0")
-    assert np.abs(scene.core.constraints(found.q[:, 0])[0]).max() < 1e-14
 
 
 def test_a_controller_keeps_a_closed_loop_on_its_way():

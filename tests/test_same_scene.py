@@ -85,8 +85,8 @@ def test_robots_of_the_same_joints_are_told_apart():
 
     for change, facts in (
         (heavier, "masses"),
-        (longer, "joints"),
-        (turned, "inertias"),
+        (longer, "translation"),
+        (turned, "inertia"),
         (geared, ("armature", "'joint2'")),
     ):
         with refused(vp.InputError, facts):

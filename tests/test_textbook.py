@@ -32,7 +32,7 @@ def test_the_jet_is_that_of_the_textbook(arm):
     scene, system = arm
     q, v = rng.normal(size=(2, scene.robot.dof))
     ours, theirs = vp.lagrangian_jet(scene, q, v), textbook.lagrangian(system, q, v)
-    for name in textbook.Lagrangian._fields:
+    for name in textbook.LagrangianJet._fields:
         expected = getattr(theirs, name)
         assert np.abs(getattr(ours, name) - expected).max() <= 1e-12 * np.abs(expected).max(), name
 
@@ -45,7 +45,7 @@ def test_slots_are_derivatives_of_the_discrete_lagrangian(arm, alpha):
     q1 = q0 + h * rng.normal(size=n)
     slots = textbook.discrete_lagrangian(system, q0, q1, h, alpha)
     ours = vp.discrete_lagrangian(scene, q0, q1, h, alpha=alpha)
-    for name in textbook.Slots._fields:
+    for name in textbook.DiscreteLagrangian._fields:
         expected = getattr(slots, name)
         assert np.abs(getattr(ours, name) - expected).max() <= 1e-11 * np.abs(expected).max(), name
     e = 1e-5

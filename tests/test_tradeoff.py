@@ -13,7 +13,7 @@ from refusals import refused
 import varpin as vp
 from varpin.show.plots import plot_study
 from varpin.show.study_report import write_report
-from varpin.simulation.ladder import INTEGRATORS
+from varpin.simulation.tolerance import INTEGRATORS
 from varpin.study import advice as advising
 from varpin.study.motion import Setting
 from varpin.study.record import pareto_front

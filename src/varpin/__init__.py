@@ -63,8 +63,6 @@ from varpin.mechanics.forces import JointDamper as JointDamper
 from varpin.mechanics.forces import JointSpring as JointSpring
 from varpin.mechanics.forces import JointStop as JointStop
 from varpin.mechanics.forces import PositionServo as PositionServo
-from varpin.mechanics.lagrangian import DiscreteLagrangian as DiscreteLagrangian
-from varpin.mechanics.lagrangian import LagrangianJet as LagrangianJet
 from varpin.mechanics.lagrangian import discrete_lagrangian as discrete_lagrangian
 from varpin.mechanics.lagrangian import lagrangian_jet as lagrangian_jet
 from varpin.mechanics.noise import AdditiveNoise as AdditiveNoise
@@ -91,6 +89,8 @@ from varpin.simulation.failures import NoiseError as NoiseError
 from varpin.simulation.failures import StepFailure as StepFailure
 from varpin.simulation.failures import ToleranceError as ToleranceError
 from varpin.simulation.simulate import simulate as simulate
+from varpin.textbook import DiscreteLagrangian as DiscreteLagrangian
+from varpin.textbook import LagrangianJet as LagrangianJet
 from varpin.trajectory import Accuracy as Accuracy
 from varpin.trajectory import Nodes as Nodes
 from varpin.trajectory import StepStatistics as StepStatistics
@@ -110,7 +110,6 @@ if TYPE_CHECKING:
     from varpin.control import Status as Status
     from varpin.control import Verification as Verification
     from varpin.control import ViolationOnRobot as ViolationOnRobot
-    from varpin.control import Violations as Violations
     from varpin.control import solve as solve
     from varpin.control.constraints import KeepClear as KeepClear
     from varpin.control.constraints import KeepInBox as KeepInBox
@@ -158,11 +157,11 @@ if TYPE_CHECKING:
     from varpin.linearization import propagate_moments as propagate_moments
     from varpin.linearization import second_order as second_order
     from varpin.model.clearance import Obstacle as Obstacle
+    from varpin.show.inspection import FrameReport as FrameReport
+    from varpin.show.inspection import JointReport as JointReport
+    from varpin.show.inspection import LinkReport as LinkReport
+    from varpin.show.inspection import RobotReport as RobotReport
     from varpin.show.inspection import inspect_robot as inspect_robot
-    from varpin.show.inspection_report import FrameReport as FrameReport
-    from varpin.show.inspection_report import JointReport as JointReport
-    from varpin.show.inspection_report import LinkReport as LinkReport
-    from varpin.show.inspection_report import RobotReport as RobotReport
     from varpin.show.replay.live import LiveView as LiveView
     from varpin.show.replay.motion import replay as replay
     from varpin.study.advice import Advice as Advice
@@ -215,8 +214,7 @@ _LATE: dict[str, tuple[str, ...]] = {
     ),
     "varpin.model.clearance": ("Obstacle",),
     "varpin.ensemble": ("Ensemble", "EnsembleInterrupted", "EnsembleStatistics", "PathFailure", "simulate_ensemble"),
-    "varpin.show.inspection": ("inspect_robot",),
-    "varpin.show.inspection_report": ("FrameReport", "JointReport", "LinkReport", "RobotReport"),
+    "varpin.show.inspection": ("FrameReport", "JointReport", "LinkReport", "RobotReport", "inspect_robot"),
     "varpin.show.replay.live": ("LiveView",),
     "varpin.show.replay.motion": ("replay",),
     "varpin.linearization": ("Curvature", "Linearization", "Moments", "linearize", "propagate_moments", "second_order"),
@@ -238,7 +236,6 @@ _LATE: dict[str, tuple[str, ...]] = {
         "Status",
         "Verification",
         "ViolationOnRobot",
-        "Violations",
         "solve",
     ),
     "varpin.study.advice": ("Advice", "Choice", "advise"),

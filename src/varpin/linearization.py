@@ -18,16 +18,11 @@ from varpin.integrators.base import diffusion_and_drift, noise_fields
 from varpin.integrators.registry import require_motion, require_scene_of
 from varpin.mechanics.noise import Fields
 from varpin.mechanics.scene import Scene, require_scene
-from varpin.model import joint_unit
-from varpin.signals.commands import open_line, open_loop
 from varpin.simulation.spectrum import fastest_rate
 from varpin.support.checks import as_floats, finite_array
 from varpin.support.differences import slopes
 from varpin.trajectory import Trajectory
 
-# Number of steps that are repeated to check the scene of a motion without scene values, and tolerances as shares of
-# the largest change of velocity in the step and of the largest velocity.
-_RETAKEN, _OF_CHANGE, _OF_SPEED = 8, 1e-5, 1e-8
 # Rates of damping, times the step, from which the stationary variance of a damped velocity is wrong by a tenth: where
 # the whole impulse precedes the step, and where it is held over the step or split.
 _BEFORE, _WITHIN = 0.1, 1.1
@@ -399,42 +394,7 @@ def _matching(scene: Scene, trajectory: Trajectory, given: Integrator | None) ->
     require_motion(scene, trajectory)
     integrator = _integrator_of(scene, trajectory, given)
     require_scene_of(scene, trajectory)
-    functions = scene.custom is not None or "constraints.custom" in scene.values
-    if not trajectory.scene_values or functions:
-        _require_steps_of(scene, trajectory, integrator)
     return integrator
-
-
-def _require_steps_of(scene: Scene, trajectory: Trajectory, integrator: Integrator) -> None:
-    """Refuse a motion of another scene, by repeating some of its steps, where it has no values of the scene to compare.
-
-    Split steps, and steps with noise after the first, depend on more than a node and are left out.
-
-    Raises:
-        InputError: A step differs; the message names it and the difference.
-    """
-    whole = np.flatnonzero(trajectory.statistics.substeps <= 1)
-    if trajectory.noisy:
-        whole = whole[whole == 0]
-    speed = float(np.abs(trajectory.v).max())
-    for k in whole[np.unique(np.linspace(0, whole.size - 1, min(_RETAKEN, whole.size)).astype(np.int64))].tolist():
-        state, _ = integrator.start(scene, trajectory.q[k : k + 1].copy(), trajectory.v[k : k + 1].copy())
-        commands = open_loop(trajectory.u[k : k + 1])
-        if trajectory.u_nodes.shape[1]:
-            commands = open_line(trajectory.u_nodes[k : k + 2], integrator.stage_times)
-        elif trajectory.u_stages.shape[1]:
-            commands = commands._replace(within=trajectory.u_stages[k : k + 1])
-        drawn = trajectory.dw[None, k : k + 1] if trajectory.noisy else np.zeros((0, 0, scene.processes))
-        (again,) = integrator.rollout(scene, state, commands, drawn, trajectory.dt)
-        if again.failure is not None or again.statistics.substeps[0] > 1:
-            continue
-        off = float(np.abs(again.v[0] - trajectory.v[k + 1]).max())
-        change = float(np.abs(trajectory.v[k + 1] - trajectory.v[k]).max())
-        if not off <= _OF_CHANGE * change + _OF_SPEED * speed:
-            raise InputError(
-                f"the trajectory was made in another scene than the one given: in this one step {k} ends at velocities "
-                f"that are off by {off:.3g} {joint_unit(scene.robot, speed=True)}. Give the scene that made it"
-            )
 
 
 def _integrator_of(scene: Scene, trajectory: Trajectory, given: Integrator | None) -> Integrator:

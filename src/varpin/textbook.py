@@ -129,8 +129,17 @@ def system(
 # --- the Lagrangian --------------------------------------------------------------------------------------------------
 
 
-class Lagrangian(NamedTuple):
-    """L(q, v) = v'M(q)v / 2 - V(q) and its derivatives; ``Lvq[i, j]`` = d Lv[i] / d q[j]."""
+class LagrangianJet(NamedTuple):
+    """L(q, v) = v'M(q)v / 2 - V(q) and its derivatives up to second order at one (q, v).
+
+    Attributes:
+        L: Lagrangian [J].
+        Lq: dL/dq (n,) [N m or N].
+        Lv: dL/dv = M v (n,), the momentum [N m s or N s].
+        Lqq: d2L/dq2 (n, n), symmetric.
+        Lvq: d2L/dv dq (n, n): ``Lvq[i, j]`` = d Lv[i] / d q[j]; its transpose is d Lq / dv.
+        Lvv: d2L/dv2 = M (n, n), symmetric, armature included.
+    """
 
     L: float
     Lq: Floats
@@ -140,29 +149,29 @@ class Lagrangian(NamedTuple):
     Lvv: Floats
 
 
-def lagrangian(system: System, q: Floats, v: Floats) -> Lagrangian:
-    """L and its derivatives at q (n,), v (n,), from Pinocchio's algorithms.
+def lagrangian(system: System, q: Floats, v: Floats) -> LagrangianJet:
+    """L and its derivatives at q (n,), v (n,): those of the bodies, and of the springs."""
+    L, Lq, Lv, Lqq, Lvq, M = rigid_bodies(system.model, q, v)
+    stretch = q - system.rest
+    energy = float(0.5 * system.stiffness @ stretch**2)
+    return LagrangianJet(L - energy, Lq - system.stiffness * stretch, Lv, Lqq - np.diag(system.stiffness), Lvq, M)
+
+
+def rigid_bodies(model: pin.Model, q: Floats, v: Floats) -> LagrangianJet:
+    """L of a model without springs and its derivatives, from Pinocchio's algorithms.
 
     L_vv = M from ``crba`` and L_v = M v. The inverse dynamics at rest with the acceleration v are M(q) v + g(q); their
     derivative in q, minus that of g, is L_vq. L_q = C'v - g, as dM/dt = C + C'. L_qq is in :func:`rigid_body_Lqq`.
     """
-    model, data = system.model, system.model.createData()
+    data = model.createData()
     M = pin.crba(model, data, q)
     M = np.triu(M) + np.triu(M, 1).T
     pin.computeRNEADerivatives(model, data, q, np.zeros_like(v), v)
     Lvq = data.dtau_dq - pin.computeGeneralizedGravityDerivatives(model, model.createData(), q)
     C = pin.computeCoriolisMatrix(model, model.createData(), q, v)
     g = pin.computeGeneralizedGravity(model, model.createData(), q)
-    stretch = q - system.rest
-    potential = pin.computePotentialEnergy(model, data, q) + 0.5 * system.stiffness @ stretch**2
-    return Lagrangian(
-        L=float(0.5 * v @ M @ v - potential),
-        Lq=C.T @ v - g - system.stiffness * stretch,
-        Lv=M @ v,
-        Lqq=rigid_body_Lqq(model, q, v) - np.diag(system.stiffness),
-        Lvq=Lvq,
-        Lvv=M,
-    )
+    L = float(0.5 * v @ M @ v - pin.computePotentialEnergy(model, data, q))
+    return LagrangianJet(L, C.T @ v - g, M @ v, rigid_body_Lqq(model, q, v), Lvq, M)
 
 
 def rigid_body_Lqq(model: pin.Model, q: Floats, v: Floats) -> Floats:
@@ -199,8 +208,18 @@ def rigid_body_Lqq(model: pin.Model, q: Floats, v: Floats) -> Floats:
 # --- the discrete Lagrangian, section 1.1 ----------------------------------------------------------------------------
 
 
-class Slots(NamedTuple):
-    """L_d(q0, q1) and its derivatives: D1 in q0, D2 in q1; ``D2D1[i, j]`` = d D1[i] / d q1[j], D1D2 its transpose."""
+class DiscreteLagrangian(NamedTuple):
+    """The discrete Lagrangian L_d(q0, q1) of one step and its slot derivatives.
+
+    Attributes:
+        Ld: Discrete Lagrangian [J s].
+        D1: Derivative in q0 (n,); -D1 is the momentum at the start of the step.
+        D2: Derivative in q1 (n,), the momentum at its end [N m s or N s].
+        D1D1: Second derivative in q0 (n, n), symmetric.
+        D2D1: Derivative of D1 in q1 (n, n): ``D2D1[i, j]`` = d D1[i] / d q1[j].
+        D1D2: Derivative of D2 in q0 (n, n), the transpose of D2D1.
+        D2D2: Second derivative in q1 (n, n), symmetric.
+    """
 
     Ld: float
     D1: Floats
@@ -211,22 +230,26 @@ class Slots(NamedTuple):
     D2D2: Floats
 
 
-def discrete_lagrangian(system: System, q0: Floats, q1: Floats, h: float, a: float = 0.5) -> Slots:
-    """L_d = h L((1 - a) q0 + a q1, (q1 - q0) / h), the generalized midpoint rule before (1.2), by the chain rule.
+def discrete_lagrangian(system: System, q0: Floats, q1: Floats, h: float, a: float = 0.5) -> DiscreteLagrangian:
+    """L_d = h L((1 - a) q0 + a q1, (q1 - q0) / h), the generalized midpoint rule before (1.2)."""
+    return slots(lagrangian(system, (1 - a) * q0 + a * q1, (q1 - q0) / h), h, a)
 
-    Equations (D1) and (D2). q_m = (1 - a) q0 + a q1 has the derivatives 1 - a and a, v_m = (q1 - q0) / h has -1/h and
-    1/h.
+
+def slots(jet: LagrangianJet, h: float, a: float) -> DiscreteLagrangian:
+    """L_d and its slot derivatives by the chain rule, from L and its derivatives: equations (D1) and (D2).
+
+    q_m = (1 - a) q0 + a q1 has the derivatives 1 - a and a, v_m = (q1 - q0) / h has -1/h and 1/h.
     """
-    _, Lq, Lv, Lqq, Lvq, M = jet = lagrangian(system, (1 - a) * q0 + a * q1, (q1 - q0) / h)
+    L, Lq, Lv, Lqq, Lvq, M = jet
     b, Lqv = 1 - a, Lvq.T
     D2D1 = h * a * b * Lqq + b * Lqv - a * Lvq - M / h
-    return Slots(
-        Ld=h * jet.L,
+    return DiscreteLagrangian(
+        Ld=h * L,
         D1=h * b * Lq - Lv,
         D2=h * a * Lq + Lv,
         D1D1=h * b * b * Lqq - b * (Lqv + Lvq) + M / h,
         D2D1=D2D1,
-        D1D2=D2D1.T,
+        D1D2=D2D1.T.copy(),
         D2D2=h * a * a * Lqq + a * (Lqv + Lvq) + M / h,
     )
 
@@ -277,12 +300,12 @@ def step(
     q1 = q0 + h * np.linalg.solve(lagrangian(system, q0, np.zeros_like(q0)).Lvv, p0)
     last = np.inf
     for _ in range(iterations):
-        slots, forces = discrete_lagrangian(system, q0, q1, h, a), discrete_forces(system, q0, q1, u, h)
-        correction = np.linalg.solve(slots.D2D1 + forces.D2, p0 + slots.D1 + forces.F + kick)
+        Ld, forces = discrete_lagrangian(system, q0, q1, h, a), discrete_forces(system, q0, q1, u, h)
+        correction = np.linalg.solve(Ld.D2D1 + forces.D2, p0 + Ld.D1 + forces.F + kick)
         size = np.abs(correction).max()
         rounding = 64 * np.finfo(float).eps * (1.0 + np.abs(q1).max())
         if size <= rounding or (size >= last and last <= 1e3 * rounding):
-            return q1, slots.D2 + forces.F
+            return q1, Ld.D2 + forces.F
         q1, last = q1 - correction, size
     raise VarpinError(f"Newton's iteration has not converged in {iterations} iterations: a smaller h may help")
 
@@ -327,13 +350,13 @@ class StepLinearization(NamedTuple):
 
 def linearize_step(system: System, q0: Floats, q1: Floats, u: Floats, h: float, a: float = 0.5) -> StepLinearization:
     """Derivatives of a step at dw = 0 by implicit differentiation of (1.8), then of (1.9): (1.7) and (1.10)."""
-    slots, forces = discrete_lagrangian(system, q0, q1, h, a), discrete_forces(system, q0, q1, u, h)
-    minus_inverse = -np.linalg.inv(slots.D2D1 + forces.D2)  # -M_{k+1}^-1
-    N = slots.D2D2 + forces.D2
-    dq1_dq0 = minus_inverse @ (slots.D1D1 + forces.D1)  # (1.10)
+    Ld, forces = discrete_lagrangian(system, q0, q1, h, a), discrete_forces(system, q0, q1, u, h)
+    minus_inverse = -np.linalg.inv(Ld.D2D1 + forces.D2)  # -M_{k+1}^-1
+    N = Ld.D2D2 + forces.D2
+    dq1_dq0 = minus_inverse @ (Ld.D1D1 + forces.D1)  # (1.10)
     dq1_dp0 = minus_inverse
     dq1_du = minus_inverse @ forces.D3
-    A = np.block([[dq1_dq0, dq1_dp0], [N @ dq1_dq0 + slots.D1D2 + forces.D1, N @ dq1_dp0]])
+    A = np.block([[dq1_dq0, dq1_dp0], [N @ dq1_dq0 + Ld.D1D2 + forces.D1, N @ dq1_dp0]])
     B = np.vstack([dq1_du, N @ dq1_du + forces.D3])
     return StepLinearization(A, B, A[:, q0.size :], *system.fields(q0, u))
 

@@ -147,20 +147,17 @@ std::ptrdiff_t run_on_roots(RootPass& pass, double h, int hold, double regulariz
     return pass.run(h, hold, regularization, given.steps, costs, gains);
 }
 
-// The linearized motion under a plan from `state`, overwritten by that at the end: expected (R, 2n + m), moves (R, m).
-// True where a control reaches a limit.
-bool foresee(int hold, In<3> A, In<3> B, In<2> feedforward, In<3> feedback, In<3> slack, InOut<1> state,
-             InOut<2> expected, InOut<2> moves, std::optional<InOut<2>> after) {
-    const std::size_t N = A.shape(0), x = A.shape(1), m = B.shape(2), size = x + m;
-    const std::size_t R = decisions_of(N, hold);
+// The changes of the controls, moves (R, m), and the states after each step, after (N, 2n), of a linearized motion under
+// a plan. True where a control reaches a limit.
+bool foresee(int hold, In<3> A, In<3> B, In<2> feedforward, In<3> feedback, In<3> slack, InOut<2> moves,
+             InOut<2> after) {
+    const std::size_t N = A.shape(0), x = A.shape(1), m = B.shape(2), R = decisions_of(N, hold);
     require(A, "A", {N, x, x});
     require(B, "B", {N, x, m});
     require(feedforward, "feedforward", {R, m});
     require(feedback, "feedback", {R, m, x});
-    require(state, "state", {size});
-    require(expected, "expected", {R, size});
     require(moves, "moves", {R, m});
-    if (after) require(*after, "after", {N, x});
+    require(after, "after", {N, x});
     const LinearizedPlan plan{.steps = static_cast<std::ptrdiff_t>(N),
                               .states = static_cast<int>(x),
                               .controls = static_cast<int>(m),
@@ -171,7 +168,7 @@ bool foresee(int hold, In<3> A, In<3> B, In<2> feedforward, In<3> feedback, In<3
                               .feedback = feedback.data(),
                               .slack = given(slack, "slack", {R, 2, m}) ? slack.data() : nullptr};
     nb::gil_scoped_release release;
-    return predict(plan, state.data(), expected.data(), moves.data(), after ? after->data() : nullptr);
+    return predict(plan, moves.data(), after.data());
 }
 
 template <class Pass>
@@ -201,8 +198,8 @@ void register_backward(nb::module_& m) {
     root_pass.def("__init__", &make_root_pass, "controls"_a, "terminal"_a, "gradient"_a)
         .def("run", &run_on_roots, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a, "running"_a);
     define_results(root_pass);
-    m.def("foresee", &foresee, "hold"_a, "A"_a, "B"_a, "feedforward"_a, "feedback"_a, "slack"_a, "state"_a.noconvert(),
-          "expected"_a.noconvert(), "moves"_a.noconvert(), "after"_a.noconvert().none() = nb::none());
+    m.def("foresee", &foresee, "hold"_a, "A"_a, "B"_a, "feedforward"_a, "feedback"_a, "slack"_a, "moves"_a.noconvert(),
+          "after"_a.noconvert());
 }
 
 }  // namespace varpin::border

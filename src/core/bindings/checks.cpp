@@ -1,41 +1,16 @@
-// Checks of a finished motion.
-#include "varpin/checks.hpp"
+// The error of a finished motion.
+#include "varpin/clearance.hpp"
 
-#include <nanobind/stl/tuple.h>
-
-#include <tuple>
 #include <utility>
 
 #include "arrays.hpp"
 #include "registrations.hpp"
-#include "varpin/clearance.hpp"
 
 namespace varpin::border {
 
 namespace {
 
 using namespace nanobind::literals;
-
-// Call `check` with the rows of q, v and f (K, n).
-template <class Check>
-auto at_rows(const Mechanism& mechanism, const In<2>& q, const In<2>& v, const In<2>& f, const Check& check) {
-    const auto n = static_cast<std::size_t>(mechanism.dof());
-    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}, {&f, "f"}}) require(*array, name, {q.shape(0), n});
-    nb::gil_scoped_release release;
-    Inertias inertias(mechanism);
-    return check(inertias, States{q.data(), v.data(), f.data(), q.shape(0)});
-}
-
-double fastest_damping_at(const Mechanism& mechanism, In<2> q, In<2> v, In<2> f, double least) {
-    if (!(least > 0.0)) throw std::invalid_argument("least must be a positive rate");
-    return at_rows(mechanism, q, v, f,
-                   [&](Inertias& inertias, const States& states) { return fastest_damping(inertias, states, least); });
-}
-
-bool pulls_fast_at(const Mechanism& mechanism, In<2> q, In<2> v, In<2> f, double dt) {
-    return at_rows(mechanism, q, v, f,
-                   [&](Inertias& inertias, const States& states) { return pulls_fast(inertias, states, dt); });
-}
 
 Stretch stretch_of(In<3> curves, In<3> sums, In<2> places) {
     const std::size_t steps = sums.shape(1), points = sums.shape(2), all = places.shape(1);
@@ -44,16 +19,13 @@ Stretch stretch_of(In<3> curves, In<3> sums, In<2> places) {
     require(curves, "curves", {2, points, 3 * (steps + 1)});
     require(sums, "sums", {2, steps, points});
     require(places, "places", {points, all});
-    const auto copied = [](const auto& array) {
-        return std::vector<double>(array.data(), array.data() + array.size());
-    };
     return {
         static_cast<int>(steps), static_cast<int>(points), static_cast<int>(all / steps), copied(curves), copied(sums),
         copied(places)};
 }
 
 Out propagated_errors(const Mechanism& mechanism, In<2> q, In<2> v, In<2> u, In<3> within, double dt,
-                      const Stretch& narrow, const Stretch* wide, double damping, std::int64_t damped_at, In<1> most_q,
+                      const Stretch& narrow, const Stretch* wide, bool damped, In<1> most_q,
                       In<1> most_v) {
     const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
     const std::size_t steps = u.shape(0), stages = within.shape(1);
@@ -66,41 +38,22 @@ Out propagated_errors(const Mechanism& mechanism, In<2> q, In<2> v, In<2> u, In<
         throw std::invalid_argument("narrow and wide must be stretches of one step and of two");
     if (static_cast<std::size_t>(narrow.stages) != stages || (wide && wide->stages != narrow.stages))
         throw std::invalid_argument("narrow and wide must have the stages of the controls");
-    if (damped_at < 2) throw std::invalid_argument("damped_at must be at least 2");
     std::vector<double> found;
     {
         nb::gil_scoped_release release;
         const Record record{static_cast<std::int64_t>(steps), q.data(), v.data(), u.data(), dt};
-        Clearance clearance(mechanism, record, stages > 0 ? within.data() : nullptr, narrow, wide, damping, damped_at);
+        Clearance clearance(mechanism, record, stages > 0 ? within.data() : nullptr, narrow, wide, damped);
         found = clearance.errors(most_q.data(), most_v.data());
     }
     return array_of(found.data(), {n});
 }
 
-std::tuple<bool, bool, bool> inside_bounds(const Mechanism& mechanism, In<2> q, In<2> v, In<2> u, In<3> within,
-                                           In<3> bounds) {
-    const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
-    const std::size_t steps = u.shape(0), stages = within.shape(1);
-    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}}) require(*array, name, {steps + 1, n});
-    require(u, "u", {steps, m});
-    require(within, "within", {steps, stages, m});
-    require(bounds, "bounds", {3, 2, n});
-    nb::gil_scoped_release release;
-    const Record record{static_cast<std::int64_t>(steps), q.data(), v.data(), u.data(), 0.0};
-    const Inside found =
-        inside_of(mechanism, record, stages > 0 ? within.data() : nullptr, static_cast<int>(stages), bounds.data());
-    return {found.position, found.velocity, found.effort};
-}
-
 }  // namespace
 
 void register_checks(nb::module_& m) {
-    m.def("fastest_damping", &fastest_damping_at, "mechanism"_a, "q"_a, "v"_a, "f"_a, "least"_a);
-    m.def("pulls_fast", &pulls_fast_at, "mechanism"_a, "q"_a, "v"_a, "f"_a, "dt"_a);
     nb::class_<Stretch>(m, "Stretch").def_static("make", &stretch_of, nb::kw_only(), "curves"_a, "sums"_a, "places"_a);
     m.def("propagated_errors", &propagated_errors, "mechanism"_a, "q"_a, "v"_a, "u"_a, "within"_a, "dt"_a,
-          nb::kw_only(), "narrow"_a, "wide"_a.none(), "damping"_a, "damped_at"_a, "most_q"_a, "most_v"_a);
-    m.def("inside_bounds", &inside_bounds, "mechanism"_a, "q"_a, "v"_a, "u"_a, "within"_a, "bounds"_a);
+          nb::kw_only(), "narrow"_a, "wide"_a.none(), "damped"_a, "most_q"_a, "most_v"_a);
 }
 
 }  // namespace varpin::border

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -13,7 +13,6 @@ from typing import Literal
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.costs import JointLimitBarrier, VelocityLimitBarrier
 from varpin.control.history import Iteration, Refinement, SearchState, Status
 from varpin.control.monte_carlo import MonteCarlo, monte_carlo
 from varpin.control.multipliers import ConstraintReport, Multipliers, reports
@@ -25,38 +24,11 @@ from varpin.control.verification import Verification, verify
 from varpin.errors import InputError
 from varpin.finding import Finding
 from varpin.linearization import velocity_at_nodes
-from varpin.model import joint_unit
 from varpin.signals.policy import LinearPolicy
 from varpin.support.checks import JointValues, count, positive, word
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, folded, listed, table, warning_count
 from varpin.trajectory import Trajectory
-
-
-@dataclass(frozen=True, eq=False)
-class Violations:
-    """Largest violation of limits by a motion's nodes for each joint or control; zero where limits hold.
-
-    Attributes:
-        position: Beyond the limits of the robot's joints, or of a narrower :class:`varpin.JointLimitBarrier` in the
-            cost (n,) [rad or m].
-        velocity: Likewise (n,) [rad/s or m/s].
-        control: Beyond the problem's control limits (m,).
-    """
-
-    position: Floats
-    velocity: Floats
-    control: Floats
-
-    @property
-    def any(self) -> bool:
-        """Whether any limit is violated."""
-        return bool(any(part.any() for part in (self.position, self.velocity, self.control)))
-
-    def __repr__(self) -> str:
-        parts = {"position": self.position, "velocity": self.velocity, "control": self.control}
-        beyond = [f"{name} by up to {part.max():.3g}" for name, part in parts.items() if part.any()]
-        return f"Violations({', '.join(beyond) or 'none'})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +72,7 @@ class Solution(Frozen):
         history: One entry for each iteration.
         search: State of the search, from which :func:`varpin.solve` continues with ``resume``.
         warnings: Warnings about the plan, each with what to change: its cost is higher when its steps are taken in
-            quarters, its velocities alternate or oscillate, its energy balance does not close, the requested true cost
-            is not met.
+            quarters, it passes limits, the requested true cost is not met.
         refinement: The steps tried where ``true_cost`` was given; else None.
         multipliers: Multipliers of the problem's constraints, with their margins; None without constraints.
     """
@@ -142,19 +113,6 @@ class Solution(Frozen):
         """Number of iterations with a line search."""
         return sum(item.rollouts > 0 for item in self.history)
 
-    @property
-    def violations(self) -> Violations:
-        """Violations of the joint limits, in the cost or not, and of the control limits."""
-        robot, motion, speed = self.problem.scene.robot, self.trajectory, self.problem.scene.robot.velocity_limit
-        terms = self.problem.cost.terms
-        joints = (term.limits for term in terms if isinstance(term, JointLimitBarrier))
-        speeds = (term.limits for term in terms if isinstance(term, VelocityLimitBarrier))
-        return Violations(
-            position=_beyond(motion.q, [robot.position_limits, *joints]),
-            velocity=_beyond(motion.v, [(-speed, speed), *speeds]),
-            control=_beyond(self.problem.control_rows(motion), [self.problem.control_limits]),
-        )
-
     @cached_property
     def constraints(self) -> tuple[ConstraintReport, ...]:
         """How well the motion satisfies each of the problem's constraints, in their order."""
@@ -182,28 +140,21 @@ class Solution(Frozen):
         )
 
     def _repr_html_(self) -> str:
-        problem, beyond, robot = self.problem, self.violations, self.problem.scene.robot
+        problem = self.problem
+        most = np.abs(problem.control_rows(self.trajectory)).max(axis=0, initial=0.0)
         rows: list[tuple[str, object]] = [
             ("status", self.status.value),
             ("why", self.reason),
             ("cost", f"{self.cost:.6g}" + (f", and {self.noise_cost:.4g} by noise" if self.noise_cost else "")),
             ("iterations", f"{self.iterations} in {sum(item.seconds for item in self.history):.3g} s"),
             ("horizon", f"{problem.steps} steps of {problem.dt:g} s, {problem.integrator}"),
+            *(("constraint", report) for report in self.constraints),
+            *(("warning", warning) for warning in self.warnings),
+            ("largest controls", listed(f"{value:.4g}" for value in most)),
         ]
-        for what, part in (("position", beyond.position), ("velocity", beyond.velocity)):
-            over = [f"{name} {value:.3g}" for name, value in zip(robot.joint_names, part, strict=True) if value]
-            if over:
-                unit = joint_unit(robot, speed=what == "velocity")
-                rows.append((f"{what} beyond limits [{unit}]", listed(over)))
-        if beyond.control.any():
-            rows.append(("controls beyond limits", f"{beyond.control.max():.3g} at most"))
-        rows += [("constraint", report) for report in self.constraints]
-        rows += [("warning", warning) for warning in self.warnings]
-        most = np.abs(problem.control_rows(self.trajectory)).max(axis=0, initial=0.0)
-        rows.append(("largest controls", listed(f"{value:.4g}" for value in most)))
         history = [str(item).rstrip(" *").split() for item in self.history]
         columns = Iteration.HEADER.replace("noise cost", "noise").split()
-        return facts(f"Plan for {robot.name}", rows, folded("iterations", table(columns, history)))
+        return facts(f"Plan for {problem.scene.robot.name}", rows, folded("iterations", table(columns, history)))
 
     def table(self) -> str:
         """The iterations, one row each, and how and why they ended; :class:`Solution` explains the columns."""
@@ -306,7 +257,6 @@ class Solution(Frozen):
             self.trajectory,
             self.cost,
             self.policy_on,
-            status=self.status,
             tolerance=tolerance,
             max_substeps=max_substeps,
             progress=progress,
@@ -346,26 +296,18 @@ class Solution(Frozen):
         policy, gains = self.policy, Feedback(self.gains, self.previous_gains)
         if not feedback:
             policy, gains = policy.without_feedback(), Feedback(np.zeros(self.gains.shape), None)
+        steps, known = Steps(self.problem, self.trajectory), np.isfinite(self.noise_cost)
         return monte_carlo(
             self.problem,
             policy,
             self.expected_cost,
             paths,
             rng,
-            within=left_within_steps(Steps(self.problem, self.trajectory), gains)
-            if np.isfinite(self.noise_cost)
-            else 0.0,
+            within=left_within_steps(steps, gains) if known else 0.0,
             workers=workers,
             executor=executor,
             progress=progress,
         )
-
-
-def _beyond(y: Floats, limits: Sequence[tuple[Floats, Floats] | Floats]) -> Floats:
-    """Largest violation of any of the limits by each column of y (N, k)."""
-    excess = [np.maximum(y - upper, lower - y).max(axis=0) for lower, upper in limits]
-    most: Floats = np.maximum(0.0, np.max(excess, axis=0))
-    return most
 
 
 def rest_of(

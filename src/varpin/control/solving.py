@@ -134,9 +134,9 @@ def solve(
     if states is not None and resume is not None:
         raise InputError("resume goes on from the solution's own states: leave out either states or resume")
     path = None if states is None else path_of(problem, states)
-    # Before the search, which may take long where values are in wrong units.
-    before = foreseen(problem) if check else []
-    announce(logger, problem.scene.announced, problem.dt, before)
+    if check:
+        # The search may take long where values are in wrong units.
+        announce(logger, problem.scene.announced, problem.dt, foreseen(problem))
 
     def searched(
         problem: OptimalControlProblem,
@@ -180,7 +180,7 @@ def solve(
                 return searched(finer, given, None, on, max(tolerance, SUFFICIENT * wish))
 
             solution = refine(problem, once, wish, lambda: deadline - time.perf_counter())
-    return looked_at(solution, before if true_cost is None else None)[0] if check else solution
+    return looked_at(solution) if check else solution
 
 
 def _require_resumable(problem: OptimalControlProblem, controls: object, resume: Solution) -> None:

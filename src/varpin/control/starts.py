@@ -16,7 +16,7 @@ from varpin.errors import InputError, VarpinError
 from varpin.linearization import node_jets
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.model import degrees_hint
-from varpin.signals.inputs import as_moved, with_ends
+from varpin.signals.commands import as_moved, with_ends
 from varpin.simulation.record import rollout
 from varpin.support.checks import finite_array
 from varpin.trajectory import Trajectory

@@ -19,17 +19,10 @@ from varpin.core._core import Stretch as Stretch
 from varpin.core._core import Subject as Subject
 from varpin.core._core import Tableau as Tableau
 from varpin.core._core import accelerations as accelerations
-from varpin.core._core import change_values as change_values
 from varpin.core._core import constrained_derivatives as constrained_derivatives
 from varpin.core._core import coupling_kinds as coupling_kinds
 from varpin.core._core import element_kinds as element_kinds
-from varpin.core._core import expand_changes as expand_changes
-from varpin.core._core import fastest_damping as fastest_damping
 from varpin.core._core import foresee as foresee
-from varpin.core._core import inside_bounds as inside_bounds
 from varpin.core._core import inverse_dynamics as inverse_dynamics
 from varpin.core._core import linearize_explicit as linearize_explicit
 from varpin.core._core import propagated_errors as propagated_errors
-from varpin.core._core import pulls_fast as pulls_fast
-from varpin.core._core import sample_steps as sample_steps
-from varpin.core._core import stake_of as stake_of

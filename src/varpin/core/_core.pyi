@@ -292,20 +292,15 @@ def foresee(
     feedforward: Floats,
     feedback: Floats,
     slack: Floats,
-    state: Floats,
-    expected: Floats,
     moves: Floats,
-    after: Floats | None = None,
+    after: Floats,
 ) -> bool:
-    """The deviations on N linearized steps under a plan of R decisions.
+    """The deviations on N linearized steps under a plan of R decisions, from the nominal state.
 
     Its steps are ``A`` (N, 2n, 2n) and ``B`` (N, 2n, m), its controls change by ``feedforward`` (R, m) and
-    ``feedback`` (R, m, 2n) of the state, clipped to ``slack`` (R, 2, m) unless it is empty.
-
-    ``state`` (2n + m,) has the deviations of the state and of the previous control at the start, and is overwritten by
-    those at the end. ``expected`` (R, 2n + m) receives those before each decision, ``moves`` (R, m) the changes of the
-    controls, and ``after`` (N, 2n) the deviations of the state after each step. The result tells whether a control
-    reaches a limit.
+    ``feedback`` (R, m, 2n) of the state, clipped to ``slack`` (R, 2, m) unless it is empty. ``moves`` (R, m) receives
+    the changes of the controls, ``after`` (N, 2n) the deviations of the state after each step. The result tells whether
+    a control reaches a limit.
     """
 
 class Links:
@@ -425,12 +420,6 @@ def linearize_explicit(
     Also returns the number of rows before the first whose mass matrix is not positive definite.
     """
 
-def fastest_damping(mechanism: Mechanism, q: Floats, v: Floats, f: Floats, least: float) -> float:
-    """The fastest damping rate [1/s] at rows of q, v and the controls' forces f (K, n); 0 below ``least``."""
-
-def pulls_fast(mechanism: Mechanism, q: Floats, v: Floats, f: Floats, dt: float) -> bool:
-    """Whether springs, servos or gravity advance a mode by more than a radian in dt [s], at a row of q, v, f (K, n)."""
-
 class Stretch:
     """Polynomials over consecutive steps, and a quadrature on them; see src/core/include/varpin/clearance.hpp."""
 
@@ -448,8 +437,7 @@ def propagated_errors(
     *,
     narrow: Stretch,
     wide: Stretch | None,
-    damping: float,
-    damped_at: int,
+    damped: bool,
     most_q: Floats,
     most_v: Floats,
 ) -> Floats:
@@ -458,15 +446,7 @@ def propagated_errors(
     They are infinite where they are not known, or where those of q exceed ``most_q`` or those of v ``most_v`` (n,). The
     controls are u (N, m), and those at the stages of each step ``within`` (N, s, m), s = 0 for controls that are
     constant over each; ``narrow`` is a stretch of one step, ``wide`` of two. Along single steps errors are not known
-    where one of ``damped_at`` nodes has dampers faster than ``damping`` / dt.
-    """
-
-def inside_bounds(
-    mechanism: Mechanism, q: Floats, v: Floats, u: Floats, within: Floats, bounds: Floats
-) -> tuple[bool, bool, bool]:
-    """Whether q and v (N + 1, n) and the controls' forces are each within ``bounds`` (3, 2, n), the least and the most.
-
-    The controls are u (N, m), and those at the stages of each step ``within`` (N, s, m).
+    where there are fast dampers, ``damped``.
     """
 
 class Subject(Enum):
@@ -507,24 +487,3 @@ class CostTerms:
 
     def expand(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats]:
         """Gradient (N, 2n + m) and Gauss-Newton Hessian (N or 1, 2n + m, 2n + m) of all terms."""
-
-    def expand_steps(self, rule: Floats, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats]:
-        """:meth:`expand` at the samples of the rule (s, 9) in the steps of q and v (N + 1, n) under u (N, m)."""
-
-def change_values(weight: Floats, before: Floats, u: Floats) -> Floats:
-    """The cost (P, N) of each change of controls (P, N, m), weight (m, m) . (u_k - u_(k-1))^2.
-
-    ``before`` is the control before the first one (1, m), or (0, m) if the first change has no cost.
-    """
-
-def expand_changes(weight: Floats, before: Floats, u: Floats) -> tuple[Floats, Floats]:
-    """Gradients (N, m) and Hessians (N, m, m) in u_k of the cost of :func:`change_values`, at fixed u_(k-1)."""
-
-def sample_steps(rule: Floats, q: Floats, v: Floats) -> tuple[Floats, Floats]:
-    """Samples (P, N s, n) of q and v from their nodes (P, N + 1, n), by a rule (s, 9)."""
-
-def stake_of(gradient: Floats, hessian: Floats, displacement: Floats) -> tuple[float, float]:
-    """Free and moved stake, equation (O9), of models with gradients (N, k) and Hessians (N or 1, k, k).
-
-    The second is bounded by each model's change over its ``displacement`` (N, k).
-    """

@@ -19,8 +19,7 @@ from varpin.integrators.base import Failure
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
 from varpin.mechanics.wiener import Children
-from varpin.signals.commands import lines, rows
-from varpin.signals.inputs import as_moved, with_ends
+from varpin.signals.commands import as_moved, lines, rows, with_ends
 from varpin.simulation.record import located
 from varpin.support.frozen import Frozen
 

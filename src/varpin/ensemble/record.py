@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.finding import Finding
-from varpin.io.archive import read_npz, record_of, save_npz
+from varpin.io.archive import Axes, read_npz, record_of, save_npz
 from varpin.support.checks import path_like
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, table, warning_count
@@ -36,14 +37,14 @@ class EnsembleStatistics(Frozen):
         count: Number of paths at each node (N + 1,): those that have not failed before.
     """
 
-    mean: Floats
-    covariance: Floats
-    levels: Floats
-    quantiles: Floats
+    mean: Annotated[Floats, Axes("nodes", "states")]
+    covariance: Annotated[Floats, Axes("nodes", "states", "states")]
+    levels: Annotated[Floats, Axes("levels")]
+    quantiles: Annotated[Floats, Axes("levels", "nodes", "states")]
     quantile_paths: int
-    energy_mean: Floats
-    energy_deviation: Floats
-    count: NDArray[np.int64]
+    energy_mean: Annotated[Floats, Axes("nodes")]
+    energy_deviation: Annotated[Floats, Axes("nodes")]
+    count: Annotated[NDArray[np.int64], Axes("nodes")]
 
     def __repr__(self) -> str:
         nodes, states = self.mean.shape
@@ -84,13 +85,13 @@ class Ensemble(Frozen):
         integrator: The integrator of all paths.
     """
 
-    t: Floats
+    t: Annotated[Floats, Axes("nodes", finite=True)]
     statistics: EnsembleStatistics
-    q: Floats | None = None
-    v: Floats | None = None
-    p: Floats | None = None
-    u: Floats | None = None
-    energy: Floats | None = None
+    q: Annotated[Floats, Axes("paths", "nodes", "joints")] | None = None
+    v: Annotated[Floats, Axes("paths", "nodes", "joints")] | None = None
+    p: Annotated[Floats, Axes("paths", "nodes", "joints")] | None = None
+    u: Annotated[Floats, Axes("paths", "steps", "controls")] | None = None
+    energy: Annotated[Floats, Axes("paths", "nodes")] | None = None
     failures: tuple[PathFailure, ...] = ()
     warnings: tuple[Finding, ...] = ()
     integrator: str = ""
@@ -108,7 +109,7 @@ class Ensemble(Frozen):
         """Read an ensemble that :meth:`save` wrote.
 
         Raises:
-            FileError: The file is missing, truncated, not npz or not an ensemble, or has arrays of other types.
+            FileError: The file is missing, truncated, not npz or not an ensemble, or has inconsistent arrays.
         """
         source = path_like("path", path)
         return record_of(cls, read_npz(source, FORMAT), source)

@@ -19,8 +19,19 @@ from varpin.errors import InputError, SingularMassMatrix
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.noise import Fields, over_steps
 from varpin.mechanics.scene import Scene
-from varpin.signals.commands import contiguous, control_of, ends_of, first_of, open_loop, rest_of_line, rows, steps_of
-from varpin.signals.inputs import in_parts_of_steps, prescribing, with_ends
+from varpin.signals.commands import (
+    contiguous,
+    control_of,
+    ends_of,
+    first_of,
+    in_parts_of_steps,
+    open_loop,
+    prescribing,
+    rest_of_line,
+    rows,
+    steps_of,
+    with_ends,
+)
 from varpin.trajectory import Bytes, StepStatistics, Trajectory, joined
 
 # Fields of a segment with one row for each node.

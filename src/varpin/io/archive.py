@@ -10,14 +10,13 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
-import json
 import os
 import reprlib
 import secrets
 import socket
 import typing
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from types import NoneType, UnionType
@@ -184,6 +183,8 @@ def members_of(record: Any, prefix: str = "") -> dict[str, Any]:
             continue
         if is_dataclass(value):
             members |= members_of(value, f"{name}.")
+        elif (row := _row(hint)) is not None:
+            members |= {f"{name}.{own.name}": np.array([getattr(each, own.name) for each in value]) for own in row}
         elif isinstance(value, Mapping):
             members |= {f"{name}.{key}": array for key, array in value.items()}
         else:
@@ -241,7 +242,7 @@ class _Builder:
                 tables[key] = self.tables(hint, members, f"{name}.")
             elif name in entries:
                 tables[key] = entries[name]
-            elif typing.get_origin(hint) is Mapping:
+            elif typing.get_origin(hint) is Mapping or below:
                 tables[key] = below
         return tables
 
@@ -285,9 +286,6 @@ class _Builder:
         return whole
 
     def _record(self, kind: Any, value: Any, entry: str) -> Any:
-        if isinstance(value, str):
-            with contextlib.suppress(ValueError):
-                value = json.loads(value)
         if not isinstance(value, dict):
             raise self.error(entry, reprlib.repr(value), "a table")
         hints, given = _hints(kind), {}
@@ -305,6 +303,10 @@ class _Builder:
 
     def _tuple(self, hint: Any, value: Any, entry: str) -> tuple[Any, ...]:
         kinds = typing.get_args(hint)
+        if isinstance(value, dict):
+            # Records, by columns.
+            columns = {name: np.asarray(column).tolist() for name, column in value.items()}
+            value = [dict(zip(columns, each, strict=True)) for each in zip(*columns.values(), strict=True)]
         if not isinstance(value, list) or (kinds[-1] is not ... and len(value) != len(kinds)):
             raise self.error(entry, reprlib.repr(value), "a list" if kinds[-1] is ... else f"a list of {len(kinds)}")
         wanted = [kinds[0]] * len(value) if kinds[-1] is ... else kinds
@@ -340,16 +342,19 @@ def _required(hint: Any) -> Any:
 
 
 def _texts(hint: Any) -> bool:
-    """Whether an annotation is a tuple of texts, findings or records, which are texts in files."""
-    first = typing.get_args(hint)[0] if typing.get_origin(hint) is tuple else None
-    return first in (str, Finding) or is_dataclass(first)
+    """Whether an annotation is ``tuple[str, ...]``, or of findings."""
+    return typing.get_origin(hint) is tuple and typing.get_args(hint)[0] in (str, Finding)
 
 
-def _text(value: Any) -> str:
-    """A text; a finding with its numbers, and a record of plain values, as JSON."""
-    if is_dataclass(value):
-        return json.dumps(vars(value))
-    return value.entry() if isinstance(value, Finding) else str(value)
+def _row(hint: Any) -> Sequence[Any] | None:
+    """The fields of the records in an annotation ``tuple[record, ...]``; None of others."""
+    kinds = typing.get_args(hint) if typing.get_origin(hint) is tuple else (None,)
+    return fields(kinds[0]) if is_dataclass(kinds[0]) else None
+
+
+def _text(value: str) -> str:
+    """A text, or a finding with its numbers, as one string."""
+    return value.entry() if isinstance(value, Finding) else value
 
 
 def _array_type(hint: Any) -> tuple[np.dtype[Any], Axes | None]:

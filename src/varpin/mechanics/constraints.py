@@ -12,17 +12,18 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from functools import partial
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats
 from varpin.core.arrays import Carried, ConstraintRows, CustomRows, Product, Tied
-from varpin.errors import InputError, UnknownJoint
-from varpin.mechanics.forces import Described, Point, point_of, require_index, require_movable, shown
+from varpin.errors import InputError
+from varpin.mechanics.forces import Described, End, Point, ends_of, require_indices, shown
 from varpin.model import Robot
-from varpin.support.checks import as_floats, count, finite, finite_array, is_one_of, positive, returned, tuple_of
+from varpin.support.checks import as_floats, count, finite_array, positive, returned, rotation_matrix, tuple_of, word
 from varpin.support.differences import slopes
 
 _AXES = "xyz"
@@ -63,16 +64,10 @@ def bound_constraint(constraint: Constraint, robot: Robot) -> Bound:
     if not isinstance(bound, Bound):
         raise InputError(f"{where} {bound!r}, which is no Bound")
     vectors, products, ties, customs = bound.rows
-    for part in (part for vector in vectors for part in vector):
-        require_index(f"{where} {part!r}: its body", part.body, -1, len(robot.tree.parent))
-    for product in products:
-        for index in (product.x, product.y):
-            require_index(f"{where} {product!r}: its vector", index, 0, len(vectors))
-    for tie in ties:
-        for index in (tie.follower, tie.leader):
-            require_index(f"{where} {tie!r}: its coordinate", index, 0, robot.dof)
-    for index in (index for pair in bound.aligned for index in pair):
-        require_index(f"{where} aligned = {bound.aligned!r}: its vector", index, 0, len(vectors))
+    carried = (part for vector in vectors for part in vector)
+    aligned = (Product(x, y, 1.0, 0.0) for x, y in bound.aligned)
+    for part in (*carried, *products, *ties, *aligned):
+        require_indices(f"{where} {part!r}", part, robot, len(vectors))
     rows = len(products) + len(ties) + sum(custom.rows for custom in customs)
     if len(bound.labels) != rows:
         raise InputError(f"{where} {len(bound.labels)} labels for {rows} rows")
@@ -99,10 +94,9 @@ class PointOnPoint(Constraint):
         axes = self.axes
         if not (isinstance(axes, str) and axes and set(axes) <= set(_AXES) and len(set(axes)) == len(axes)):
             raise InputError(f"axes must be some of 'xyz', each once, got {axes!r}")
-        a, b, _ = _ends(self, robot)
-        units = [((Carried(-1, True, _row(np.eye(3)[_AXES.index(axis)])),)) for axis in axes]
-        products = tuple(Product(0, 1 + k, 1.0, 0.0) for k in range(len(units)))
-        return Bound(ConstraintRows(((a, b), *units), products), tuple(f"{self!r} along {axis}" for axis in axes))
+        a, b = _ends(self, robot)
+        units = np.eye(3)[[_AXES.index(axis) for axis in axes]]
+        return _along(a, b, -1, units, [f"{self!r} along {axis}" for axis in axes])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -127,22 +121,18 @@ class FrameOnFrame(Constraint):
             if not isinstance(getattr(self, name), str):
                 raise InputError(f"FrameOnFrame: {name} must be a frame's name, got {shown(getattr(self, name))}")
         pose = np.eye(4) if self.placement is None else finite_array("placement", self.placement, (4, 4))
-        R, x = pose[:3, :3], pose[:3, 3]
-        if np.abs(R.T @ R - np.eye(3)).max() > 1e-9 or np.linalg.det(R) < 0.0 or (pose[3] != (0, 0, 0, 1)).any():
-            raise InputError("placement must be a matrix (4, 4) of a rotation and a place")
-        (a, Ra, at), (b, Rb, there) = point_of("a", self.a, robot), point_of("b", self.b, robot)
-        _require_movable(self, a, b, robot)
-        axes, others = Ra @ R.T, Rb
-        vectors: list[tuple[Carried, ...]] = [(Carried(a, False, _row(at)), Carried(b, False, _row(there + Rb @ x)))]
-        vectors += [(Carried(-1, True, _row(axis)),) for axis in np.eye(3)]
-        vectors += [(Carried(a, True, _row(axis)),) for axis in axes.T]
-        vectors += [(Carried(b, True, _row(axis)),) for axis in others.T]
-        # d(y_a . z_b) = (w_a - w_b) . (y_a x z_b), the turn about x.
-        turns = [Product(4 + (k + 1) % 3, 7 + (k + 2) % 3, 1.0, 0.0) for k in range(3)]
-        rows = ConstraintRows(tuple(vectors), (*(Product(0, 1 + k, 1.0, 0.0) for k in range(3)), *turns))
+        R, x = rotation_matrix("placement[:3, :3]", pose[:3, :3]), pose[:3, 3]
+        if (pose[3] != (0, 0, 0, 1)).any():
+            raise InputError(f"placement[3] must be 0, 0, 0, 1, got {pose[3]}")
+        (a, Ra, at), (b, Rb, there) = _ends(self, robot)
         # The labels leave out the sixteen numbers of the placement.
         name = f"FrameOnFrame(a={self.a!r}, b={self.b!r})"
-        labels = [f"{name} along {axis}" for axis in _AXES] + [f"{name} about {axis}" for axis in _AXES]
+        labels = [f"{name} {how} {axis}" for how in ("along", "about") for axis in _AXES]
+        places = _along((a, Ra, at), (b, Rb, there + Rb @ x), -1, np.eye(3), labels[:3]).rows
+        axes = (*(_direction(a, axis) for axis in (Ra @ R.T).T), *(_direction(b, axis) for axis in Rb.T))
+        # d(y_a . z_b) = (w_a - w_b) . (y_a x z_b), the turn about x.
+        turns = [Product(4 + (k + 1) % 3, 7 + (k + 2) % 3, 1.0, 0.0) for k in range(3)]
+        rows = ConstraintRows((*places.vectors, *axes), (*places.products, *turns))
         return Bound(rows, tuple(labels), tuple((4 + k, 7 + k) for k in range(3)))
 
 
@@ -161,10 +151,8 @@ class PointOnPlane(Constraint):
     normal: ArrayLike
 
     def bind(self, robot: Robot) -> Bound:
-        a, b, turned = _ends(self, robot)
-        normal = turned @ _unit("normal", self.normal)
-        vectors = ((a, b), (Carried(b.body, True, _row(normal)),))
-        return Bound(ConstraintRows(vectors, (Product(0, 1, 1.0, 0.0),)), (f"{self!r}",))
+        a, b = _ends(self, robot)
+        return _along(a, b, b[0], [b[1] @ _unit("normal", self.normal)], [f"{self!r}"])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -182,14 +170,12 @@ class PointOnLine(Constraint):
     direction: ArrayLike
 
     def bind(self, robot: Robot) -> Bound:
-        a, b, turned = _ends(self, robot)
+        a, b = _ends(self, robot)
         along = _unit("direction", self.direction)
         first = np.cross(along, np.eye(3)[int(np.argmin(np.abs(along)))])
         first /= np.linalg.norm(first)
-        across = [turned @ first, turned @ np.cross(along, first)]
-        vectors = ((a, b), *((Carried(b.body, True, _row(axis)),) for axis in across))
-        rows = ConstraintRows(vectors, (Product(0, 1, 1.0, 0.0), Product(0, 2, 1.0, 0.0)))
-        return Bound(rows, (f"{self!r}, first row", f"{self!r}, second row"))
+        across = [b[1] @ first, b[1] @ np.cross(along, first)]
+        return _along(a, b, b[0], across, [f"{self!r}, first row", f"{self!r}, second row"])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -209,9 +195,10 @@ class Distance(Constraint):
     length: float
 
     def bind(self, robot: Robot) -> Bound:
-        a, b, _ = _ends(self, robot)
-        length = positive("length", _number(self.length), "m")
-        return Bound(ConstraintRows(((a, b),), (Product(0, 0, 0.5 / length, 0.5 * length),)), (f"{self!r}",))
+        a, b = _ends(self, robot)
+        length = positive("length", self.length, "m")
+        rows = ConstraintRows(((_point(a), _point(b)),), (Product(0, 0, 0.5 / length, 0.5 * length),))
+        return Bound(rows, (f"{self!r}",))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -231,17 +218,14 @@ class JointTie(Constraint):
     coefficients: ArrayLike = (0.0, 1.0)
 
     def bind(self, robot: Robot) -> Bound:
-        for name in (self.joint, self.leader):
-            if name not in robot.joint_names:
-                raise UnknownJoint(str(name), robot.joint_names, "JointTie")
-        if self.joint == self.leader:
+        follower, leader = robot.coordinate(self.joint), robot.coordinate(self.leader)
+        if follower == leader:
             raise InputError(f"JointTie ties joint {self.joint!r} to itself")
         given = as_floats("coefficients", self.coefficients)
         if given.ndim != 1 or not given.size:
             raise InputError(f"coefficients must have shape (k,), got {given.shape}")
         c = finite_array("coefficients", given, given.shape)
-        tie = Tied(robot.coordinate(self.joint), robot.coordinate(self.leader), tuple(c.tolist()))
-        return Bound(ConstraintRows(ties=(tie,)), (f"{self!r}",))
+        return Bound(ConstraintRows(ties=(Tied(follower, leader, tuple(c.tolist())),)), (f"{self!r}",))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -269,12 +253,7 @@ class KinematicInput(Constraint):
         return f"KinematicInput(joint={self.joint!r}{shape})"
 
     def bind(self, robot: Robot) -> Bound:
-        if not isinstance(self.joint, str):
-            raise InputError(f"KinematicInput takes the name of a joint, got {self.joint!r}")
-        if self.joint not in robot.joint_names:
-            raise UnknownJoint(self.joint, robot.joint_names, "KinematicInput")
-        if not is_one_of(self.interpolation, ("linear", "cubic")):
-            raise InputError(f"interpolation must be 'linear' or 'cubic', got {self.interpolation!r}")
+        word("interpolation", self.interpolation, ("linear", "cubic"))
         c = robot.coordinate(self.joint)
         # 0 marks a cubic; the scene fills in the index of the velocity control.
         rate = 0 if self.interpolation == "cubic" else -1
@@ -300,63 +279,40 @@ class CustomConstraint(Constraint):
 
     def __post_init__(self) -> None:
         count("rows", self.rows, least=1)
-        for name in ("value", "jacobian"):
-            if not callable(getattr(self, name)):
-                raise InputError(f"CustomConstraint: {name} must be a function of q, got {getattr(self, name)!r}")
-        if not (self.curvature is None or callable(self.curvature)):
-            raise InputError(f"CustomConstraint: curvature must be a function of q and weights, got {self.curvature!r}")
+        for name in ("value", "jacobian", "curvature"):
+            function = getattr(self, name)
+            if not callable(function) and (function is not None or name != "curvature"):
+                raise InputError(f"CustomConstraint: {name} must be a function of q, got {function!r}")
 
-    def bind(self, robot: Robot) -> Bound:
-        n, r = robot.dof, int(self.rows)
-        custom = CustomRows(r, _Values(self, n), _Curvature(self, n))
-        return Bound(ConstraintRows(customs=(custom,)), tuple(f"{self!r}, row {k}" for k in range(r)))
+    def bind(self, robot: Robot) -> Bound:  # noqa: ARG002
+        r = int(self.rows)
+        rows = ConstraintRows(customs=(CustomRows(r, self._values_at, self._curvature_at),))
+        return Bound(rows, tuple(f"{self!r}, row {k}" for k in range(r)))
+
+    def _values_at(self, q: Floats) -> tuple[Floats, Floats]:
+        """Checked g (r,) and dg/dq (r, n)."""
+        return self._checked("value", (int(self.rows),), q), self._jacobian_at(q)
+
+    def _jacobian_at(self, q: Floats) -> Floats:
+        return self._checked("jacobian", (int(self.rows), q.size), q)
+
+    def _curvature_at(self, q: Floats, weights: Floats) -> Floats:
+        """Checked sum_k w_k d2 g_k/dq2 (n, n), by differences where the user gives none."""
+        if self.curvature is not None:
+            return self._checked("curvature", (q.size, q.size), q, weights)
+        H = slopes(lambda at: weights @ self._jacobian_at(at), q, 1e-3 * np.maximum(1.0, np.abs(q)))
+        symmetric: Floats = 0.5 * (H + H.T)
+        return symmetric
+
+    def _checked(self, name: str, shape: tuple[int, ...], *arguments: Floats) -> Floats:
+        """The result of a function; a CustomConstraintError if it raised, or is not a finite array of this shape."""
+        at = f" at q = {np.array2string(arguments[0], precision=6)}"
+        call = partial(getattr(self, name), *arguments)
+        return returned(f"the {name} of a CustomConstraint", call, shape, at, CustomConstraintError)
 
 
 class CustomConstraintError(InputError):
     """A function of a custom constraint raised, or returned a wrong type, shape or value."""
-
-
-def _called(name: str, call: Callable[[], ArrayLike], shape: tuple[int, ...], q: Floats) -> Floats:
-    """The checked result of a function of a custom constraint.
-
-    Raises:
-        CustomConstraintError: The function raised, or its result is not a finite array of this shape.
-    """
-    at = f" at q = {np.array2string(q, precision=6)}"
-    return returned(f"the {name} of a CustomConstraint", call, shape, at, CustomConstraintError)
-
-
-@dataclass(frozen=True)
-class _Values:
-    """Checked g (r,) and dg/dq (r, n) of a custom constraint."""
-
-    custom: CustomConstraint
-    dof: int
-
-    def __call__(self, q: Floats) -> tuple[Floats, Floats]:
-        r = int(self.custom.rows)
-        return _called("value", lambda: self.custom.value(q), (r,), q), self.jacobian(q)
-
-    def jacobian(self, q: Floats) -> Floats:
-        return _called("jacobian", lambda: self.custom.jacobian(q), (int(self.custom.rows), self.dof), q)
-
-
-@dataclass(frozen=True)
-class _Curvature:
-    """Checked sum_k w_k d2 g_k/dq2 (n, n) of a custom constraint, by differences where the user gives none."""
-
-    custom: CustomConstraint
-    dof: int
-
-    def __call__(self, q: Floats, weights: Floats) -> Floats:
-        n = self.dof
-        curvature = self.custom.curvature
-        if curvature is not None:
-            return _called("curvature", lambda: curvature(q, weights), (n, n), q)
-        jacobian = _Values(self.custom, n).jacobian
-        H = slopes(lambda at: weights @ jacobian(at), q, 1e-3 * np.maximum(1.0, np.abs(q)))
-        symmetric: Floats = 0.5 * (H + H.T)
-        return symmetric
 
 
 def constraints_of(given: Constraint | Sequence[Constraint]) -> tuple[Constraint, ...]:
@@ -391,13 +347,21 @@ def joined(bound: Sequence[Bound]) -> tuple[Bound, NDArray[np.int64]]:
     return Bound(together, tuple(labels[row] for row in core), tuple(aligned)), np.argsort(core)
 
 
-def _row(values: Floats) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
+def _along(a: End, b: End, body: int, axes: Sequence[Floats] | Floats, labels: Sequence[str]) -> Bound:
+    """Rows axis . (x_a - x_b), with axes (3,) that are fixed to a body."""
+    vectors = ((_point(a), _point(b)), *(_direction(body, axis) for axis in axes))
+    products = tuple(Product(0, 1 + k, 1.0, 0.0) for k in range(len(axes)))
+    return Bound(ConstraintRows(vectors, products), tuple(labels))
 
 
-def _number(value: Any) -> float:
-    return float(value) if np.ndim(value) == 0 else finite("length", value)
+def _point(end: End) -> Carried:
+    x, y, z = end[2].tolist()
+    return Carried(end[0], False, (x, y, z))
+
+
+def _direction(body: int, axis: Floats) -> tuple[Carried]:
+    x, y, z = axis.tolist()
+    return (Carried(body, True, (x, y, z)),)
 
 
 def _unit(name: str, value: ArrayLike) -> Floats:
@@ -408,16 +372,10 @@ def _unit(name: str, value: ArrayLike) -> Floats:
     return given / length
 
 
-def _require_movable(constraint: Constraint, a: int, b: int, robot: Robot) -> None:
-    require_movable(constraint, a, b, robot)
-    if a == b:
+def _ends(constraint: Constraint, robot: Robot) -> tuple[End, End]:
+    a, b = ends_of(constraint, robot)
+    if a[0] == b[0]:
         raise InputError(
             f"{type(constraint).__name__}: both ends are on one body, and no joint moves one against the other"
         )
-
-
-def _ends(constraint: Any, robot: Robot) -> tuple[Carried, Carried, Floats]:
-    """The points a and b, and the rotation (3, 3) of b's frame on its body."""
-    (a, _, here), (b, turned, there) = point_of("a", constraint.a, robot), point_of("b", constraint.b, robot)
-    _require_movable(constraint, a, b, robot)
-    return Carried(a, False, _row(here)), Carried(b, False, _row(there)), turned
+    return a, b

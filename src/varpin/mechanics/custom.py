@@ -34,8 +34,6 @@ _TINY = 1e-200
 _AGREES, _DOUBT = 1e-6, 10.0
 # Differences with a larger relative error bound than this are not compared.
 _KNOWN = 1e-4
-# Number of random states at which complex steps are compared with differences, and their standard deviation.
-_PROBES, _AROUND = 2, 0.3
 
 
 class CustomForceError(InputError):
@@ -52,10 +50,10 @@ class CustomForce(Force):
 
     Attributes:
         f: Function of (q (n,), v (n,)) that returns the force (n,) [N m or N] on the n coordinates of the robot.
-        derivatives: Function of (q, v) that returns (dF/dq, dF/dv), each (n, n). It is compared with differences once,
-            at the start of the first motion. ``"complex"``: complex steps, exact to rounding, for an ``f`` of analytic
-            operations (no ``abs``, no comparisons). Left out: central differences of eighth order with adaptive steps,
-            accurate to about 1e-10 of the force where it is smooth.
+        derivatives: Function of (q, v) that returns (dF/dq, dF/dv), each (n, n). ``"complex"``: complex steps, exact to
+            rounding, for an ``f`` of analytic operations (no ``abs``, no comparisons). Both are compared with
+            differences once, at the start of the first motion. Left out: central differences of eighth order with
+            adaptive steps, accurate to about 1e-10 of the force where it is smooth.
     """
 
     f: Field
@@ -70,23 +68,16 @@ class CustomForce(Force):
             )
 
     def __repr__(self) -> str:
-        ways = {"complex": "derivatives by complex steps", None: "derivatives by differences"}
-        how = "derivatives given" if callable(self.derivatives) else ways[self.derivatives]
-        return f"CustomForce({self.name}, {how})"
+        how = "given" if callable(self.derivatives) else f"by {'complex steps' if self.derivatives else 'differences'}"
+        return f"CustomForce({self.name}, derivatives {how})"
 
     @property
     def name(self) -> str:
         """Name of the function."""
         return str(getattr(self.f, "__name__", type(self.f).__name__))
 
-    def bind(self, robot: Robot) -> tuple[Element | Coupling, ...]:
-        """See :meth:`Force.bind`; the core calls the function itself.
-
-        Raises:
-            InputError: Complex steps do not give the derivatives of ``f``.
-        """
-        if self.derivatives == "complex":
-            self._check_complex(robot.dof)
+    def bind(self, robot: Robot) -> tuple[Element | Coupling, ...]:  # noqa: ARG002
+        """Nothing: the core calls the function itself."""
         return ()
 
     def at(self, q: Floats, v: Floats) -> Floats:
@@ -103,24 +94,19 @@ class CustomForce(Force):
         Raises:
             CustomForceError: As :meth:`at`.
         """
-        n = q.size
-        if callable(self.derivatives):
-            derivatives, shape = self.derivatives, (2, n, n)
-            return tuple(self._read(lambda: derivatives(q.copy(), v.copy()), "derivatives(q, v)", shape, q, v))
-        return self._complex(q, v) if self.derivatives == "complex" else self._differences(q, v)
-
-    def _complex(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
-        def column(moved: int, c: int) -> Floats:
-            state = [q.astype(complex), v.astype(complex)]
-            state[moved][c] += 1j * _TINY
-            what = "f(q, v) of complex numbers"
-            return self._read(lambda: np.imag(np.asarray(self.f(*state))) / _TINY, what, (q.size,), q, v)
-
-        return self._columns(column, q.size)
-
-    def _differences(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
-        by_q, by_v = self._columns(lambda moved, c: self._difference(q, v, moved, c)[0], q.size)
+        n, derivatives = q.size, self.derivatives
+        if callable(derivatives):
+            return tuple(self._read(lambda: derivatives(q.copy(), v.copy()), "derivatives(q, v)", (2, n, n), q, v))
+        column = self._complex if derivatives == "complex" else self._difference
+        by_q, by_v = (np.column_stack([column(q, v, moved, c)[0] for c in range(n)]) for moved in (0, 1))
         return by_q, by_v
+
+    def _complex(self, q: Floats, v: Floats, moved: int, c: int) -> tuple[Floats, float]:
+        """:meth:`_difference` by a complex step, without an error."""
+        state = [q.astype(complex), v.astype(complex)]
+        state[moved][c] += 1j * _TINY
+        what = "f(q, v) of complex numbers"
+        return self._read(lambda: np.imag(np.asarray(self.f(*state))) / _TINY, what, (q.size,), q, v), 0.0
 
     def _difference(self, q: Floats, v: Floats, moved: int, c: int) -> tuple[Floats, float]:
         """Column ``c`` (n,) of dF/dq (``moved`` 0) or dF/dv (``moved`` 1), and a bound of its error.
@@ -145,16 +131,6 @@ class CustomForce(Force):
             if off <= _SMOOTH * max(1.0, force, float(np.abs(high).max(initial=0.0))):
                 break
         return best, least
-
-    @staticmethod
-    def _columns(column: Callable[[int, int], Floats], n: int) -> tuple[Floats, Floats]:
-        by_q, by_v = (np.column_stack([column(moved, c) for c in range(n)]) for moved in (0, 1))
-        return by_q, by_v
-
-    def _check_complex(self, n: int) -> None:
-        rng = np.random.default_rng(0)
-        for _ in range(_PROBES):
-            self.check(*(_AROUND * rng.normal(size=(2, n))))
 
     def check(self, q: Floats, v: Floats) -> None:
         """Compare derivatives from the user or from complex steps with differences at a state.
@@ -186,13 +162,9 @@ class CustomForce(Force):
                 if off > _KNOWN * size.max() or not wrong.any():
                     continue
                 r = int(np.argmax(np.abs(given[:, c] - column)))
+                why = "derivatives(q, v) is wrong"
                 if self.derivatives == "complex":
-                    why = (
-                        "complex steps do not give the derivatives of f, which drops imaginary parts somewhere (abs, "
-                        "comparisons, float(...)); leave derivatives out, or give a function"
-                    )
-                else:
-                    why = "derivatives(q, v) does not return the derivatives of f"
+                    why = "f drops imaginary parts (abs, comparisons, float): leave derivatives='complex' out"
                 raise CustomForceError(
                     f"CustomForce {self.name}: {why}: {name}[{r}, {c}] is {given[r, c]:.8g}, and differences of f give "
                     f"{column[r]:.8g}, at {_state_text(q, v)}"
@@ -224,11 +196,7 @@ class CustomForces(Frozen):
         return ", ".join(part.name for part in self.parts)
 
     def check(self, q: Floats, v: Floats) -> None:
-        """:meth:`CustomForce.check` of all forces at the first of the states q, v (P, n), in the first call only.
-
-        Raises:
-            CustomForceError: Derivatives are wrong.
-        """
+        """:meth:`CustomForce.check` of all forces at the first of the states q, v (P, n), in the first call only."""
         if self.checked or not len(q):
             return
         for part in self.parts:
@@ -240,12 +208,10 @@ class CustomForces(Frozen):
 
         All are NaN where q or v is not finite.
         """
-        n = q.size
-        size = n if derivatives else 0
-        if not (np.isfinite(q).all() and np.isfinite(v).all()):
-            return np.full(n, np.nan), np.full((size, size), np.nan), np.full((size, size), np.nan)
-        F, by_q, by_v = np.zeros(n), np.zeros((size, size)), np.zeros((size, size))
-        for part in self.parts:
+        size = q.size if derivatives else 0
+        finite = np.isfinite(q).all() and np.isfinite(v).all()
+        F, by_q, by_v = (np.full(shape, 0.0 if finite else np.nan) for shape in (q.size, (size, size), (size, size)))
+        for part in self.parts if finite else ():
             F += part.at(q, v)
             if derivatives:
                 own_q, own_v = part.slopes(q, v)

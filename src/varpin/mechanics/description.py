@@ -50,36 +50,29 @@ def _point(end: End) -> str | tuple[str, Sequence[float]]:
 
 def _tie(gear: Gear, robot: Robot) -> Constraint | None:
     follows = np.polynomial.Polynomial(gear.coefficients)
+    if gear.joint in robot.locked and gear.leader is not None and gear.leader not in robot.locked:
+        raise InputError(
+            f"robot {robot.name!r}: {gear.name} of the description ties the locked joint {gear.joint!r} to "
+            f"{gear.leader!r}: lock {gear.leader!r}, too"
+        )
     if gear.leader is not None and gear.leader not in robot.locked:
-        if gear.joint not in robot.locked:
-            return JointTie(gear.joint, gear.leader, follows.coef)
-        slope = follows.trim()
-        if slope.degree() != 1:
-            raise InputError(
-                f"robot {robot.name!r}: {gear.name} of the description ties the locked joint {gear.joint!r} to "
-                f"{gear.leader!r}, not linearly: lock {gear.leader!r}, too"
-            )
-        return _held(gear.name, gear.leader, (_locked(robot, gear.joint) - slope.coef[0]) / slope.coef[1], robot)
+        return JointTie(gear.joint, gear.leader, follows.coef)
     target = gear.coefficients[0] if gear.leader is None else float(follows(_locked(robot, gear.leader)))
     if gear.joint in robot.locked:
         _require_kept(gear.name, abs(_locked(robot, gear.joint) - target), robot)
         return None
-    return _held(gear.name, gear.joint, target, robot)
+    # A joint at a constant position is a tie that does not depend on its leader.
+    others = [other for other in robot.joint_names if other != gear.joint]
+    if not others:
+        raise InputError(
+            f"robot {robot.name!r}: {gear.name} of the description holds its only joint {gear.joint!r}, at "
+            f"{target:.6g}: nothing moves"
+        )
+    return JointTie(gear.joint, others[0], (target,))
 
 
 def _locked(robot: Robot, joint: str) -> float:
     return float(np.ravel(robot.locked[joint])[0])
-
-
-def _held(name: str, joint: str, target: float, robot: Robot) -> Constraint:
-    """A joint at a constant position: a tie that does not depend on its leader."""
-    others = [other for other in robot.joint_names if other != joint]
-    if not others:
-        raise InputError(
-            f"robot {robot.name!r}: {name} of the description holds its only joint {joint!r}, at {target:.6g}: nothing "
-            "moves"
-        )
-    return JointTie(joint, others[0], (target,))
 
 
 def _require_kept(name: str, miss: float, robot: Robot) -> None:

@@ -11,29 +11,21 @@ frame's axes (3,) [m]), or, for forces with two ends, a point in world axes (3,)
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Mask
 from varpin.core import coupling_kinds, element_kinds
 from varpin.core.arrays import Coupling, Element
-from varpin.errors import InputError, UnknownJoint
+from varpin.errors import InputError
 from varpin.model import Robot
 from varpin.model.tree import place_of_frame
-from varpin.support.checks import (
-    JointValues,
-    as_floats,
-    finite_array,
-    is_one_of,
-    joint_array,
-    rotation_matrix,
-    tuple_of,
-)
+from varpin.support.checks import JointValues, as_floats, finite_array, joint_array, rotation_matrix, tuple_of, word
 from varpin.support.frozen import Frozen
 
 # A frame name or (frame name, point in the frame's axes); a Point may also be a point in world axes.
@@ -92,15 +84,10 @@ def bound_force(force: Force, robot: Robot) -> tuple[Element | Coupling, ...]:
     bound = tuple(force.bind(robot))
     for each in bound:
         where = f"{type(force).__name__}.bind returned {each!r}"
-        if isinstance(each, Element):
-            kinds, points = ELEMENTS, 0
-            require_index(f"{where}: its coordinate", each.coordinate, 0, robot.dof)
-        elif isinstance(each, Coupling):
-            kinds, points = COUPLINGS, 6
-            for end in (each.a, each.b):
-                require_index(f"{where}: its body", end, -1, len(robot.tree.parent))
-        else:
+        if not isinstance(each, Element | Coupling):
             raise InputError(f"{where}, which is neither an Element nor a Coupling")
+        require_indices(where, each, robot)
+        kinds, points = (ELEMENTS, 0) if isinstance(each, Element) else (COUPLINGS, 6)
         if each.kind not in kinds:
             raise InputError(f"{where}, of an unknown kind; kinds: {', '.join(kinds)}")
         count = points + kinds[each.kind].numbers
@@ -109,10 +96,17 @@ def bound_force(force: Force, robot: Robot) -> tuple[Element | Coupling, ...]:
     return bound
 
 
-def require_index(what: str, index: Any, least: int, end: int) -> None:
-    """Refuse an index that is no integer from ``least`` to ``end`` - 1."""
-    if isinstance(index, bool) or not isinstance(index, int | np.integer) or not least <= index < end:
-        raise InputError(f"{what} must be an integer from {least} to {end - 1}, got {index!r}")
+def require_indices(where: str, part: Any, robot: Robot, vectors: int = 0) -> None:
+    """Refuse a part in the form of the core with an index of a coordinate, body or vector that is out of range."""
+    coordinates, bodies = range(robot.dof), range(-1, len(robot.tree.parent))
+    ranges = {"coordinate": coordinates, "follower": coordinates, "leader": coordinates}
+    ranges |= {"body": bodies, "a": bodies, "b": bodies, "x": range(vectors), "y": range(vectors)}
+    for name, index in part._asdict().items():
+        if name in ranges and (not isinstance(index, int | np.integer) or index not in ranges[name]):
+            allowed = ranges[name]
+            raise InputError(
+                f"{where}: its {name} must be an integer from {allowed.start} to {allowed.stop - 1}, got {index!r}"
+            )
 
 
 def kept(name: str, value: Any) -> Any:
@@ -139,8 +133,43 @@ def shown(value: Any) -> str:
     return str(dict(value) if isinstance(value, Mapping) else value.tolist())
 
 
+# Parameters of forces on joints, other than those >= 0: of any sign, > 0 where the force acts, and limits, with the
+# number for joints without one.
+_SIGNED, _POSITIVE = ("rest", "lower", "upper"), ("width", "stribeck_velocity", "effort")
+_LIMITS = {"lower": -np.inf, "upper": np.inf, "effort": np.inf}
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class JointSpring(Force):
+class JointForce(Force):
+    """A force on single joints, whose parameters are numbers for each joint.
+
+    Attributes:
+        columns: The parameters in the order of the core; that of the class if empty.
+    """
+
+    columns: ClassVar[tuple[str, ...]] = ()
+
+    def bind(self, robot: Robot) -> tuple[Element, ...]:
+        numbers: dict[str, Floats] = {}
+        for name in (item.name for item in fields(self) if getattr(self, item.name) is not None):
+            none = _LIMITS.get(name, 0.0)
+            values = joint_array(name, getattr(self, name), robot.joint_names, uniform=True, absent=none)
+            if name in _LIMITS:
+                _refuse(name, values, np.isnan(values) | (values == -none), f"must be a number, or {none} for none")
+            numbers[name] = values if name in _SIGNED + _POSITIVE else not_negative(name, values)
+        acts = self.acts(numbers, robot)
+        for name in numbers.keys() & set(_POSITIVE):
+            _refuse(name, numbers[name], acts & ~(numbers[name] > 0.0), "must be > 0")
+        table = np.column_stack([numbers[name] for name in self.columns or numbers])
+        return tuple(Element(type(self).__name__, int(c), tuple(table[c].tolist())) for c in np.flatnonzero(acts))
+
+    def acts(self, numbers: dict[str, Floats], robot: Robot) -> Mask:  # noqa: ARG002
+        """Whether the force acts on each joint (n,); parameters that are left out are added to ``numbers`` here."""
+        return np.asarray(next(iter(numbers.values())) > 0.0)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class JointSpring(JointForce):
     """Linear springs: the force -stiffness * (q - rest). Their energy is part of the potential energy.
 
     Attributes:
@@ -151,14 +180,9 @@ class JointSpring(Force):
     stiffness: JointValues
     rest: JointValues = 0.0
 
-    def bind(self, robot: Robot) -> tuple[Element, ...]:
-        stiffness = not_negative("stiffness", self.stiffness, robot)
-        rest = joint_array("rest", self.rest, robot.joint_names, uniform=True)
-        return tuple(_elements("JointSpring", stiffness > 0.0, stiffness, rest))
-
 
 @dataclass(frozen=True, eq=False, repr=False)
-class JointDamper(Force):
+class JointDamper(JointForce):
     """Viscous damping: the force -damping * v.
 
     Attributes:
@@ -167,13 +191,9 @@ class JointDamper(Force):
 
     damping: JointValues
 
-    def bind(self, robot: Robot) -> tuple[Element, ...]:
-        damping = not_negative("damping", self.damping, robot)
-        return tuple(_elements("JointDamper", damping > 0.0, damping))
-
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Armature(Force):
+class Armature(JointForce):
     """Rotor inertia reflected to the joints, gear ratio squared times rotor inertia; it adds to the robot's armature.
 
     Attributes:
@@ -182,13 +202,9 @@ class Armature(Force):
 
     inertia: JointValues
 
-    def bind(self, robot: Robot) -> tuple[Element, ...]:
-        inertia = not_negative("inertia", self.inertia, robot)
-        return tuple(_elements("Armature", inertia > 0.0, inertia))
-
 
 @dataclass(frozen=True, eq=False, repr=False)
-class CoulombFriction(Force):
+class CoulombFriction(JointForce):
     """Dry friction, smooth in the velocity: the force -g(v) tanh(v / width).
 
     g is ``level``; or, with ``breakaway``, level + (breakaway - level) exp(-(v / stribeck_velocity)^2). Joints do not
@@ -207,24 +223,21 @@ class CoulombFriction(Force):
     width: JointValues = 0.01
     breakaway: JointValues | None = None
     stribeck_velocity: JointValues | None = None
+    columns = ("level", "width", "breakaway", "stribeck_velocity")
 
-    def bind(self, robot: Robot) -> tuple[Element, ...]:
+    def acts(self, numbers: dict[str, Floats], robot: Robot) -> Mask:  # noqa: ARG002
         if (self.breakaway is None) != (self.stribeck_velocity is None):
             raise InputError("breakaway and stribeck_velocity belong together: give both or neither")
-        level = not_negative("level", self.level, robot)
-        breakaway, fading = level, np.ones_like(level)
-        acts = level > 0.0
-        if self.breakaway is not None and self.stribeck_velocity is not None:
-            breakaway = not_negative("breakaway", self.breakaway, robot)
-            acts |= breakaway > 0.0
-            _refuse("breakaway", breakaway, acts & (breakaway < level), "must be at least the level")
-            fading = _positive("stribeck_velocity", self.stribeck_velocity, robot, acts)
-        width = _positive("width", self.width, robot, acts)
-        return tuple(_elements("CoulombFriction", acts, level, width, breakaway, fading))
+        level = numbers["level"]
+        breakaway = numbers.setdefault("breakaway", level)
+        numbers.setdefault("stribeck_velocity", np.ones_like(level))
+        acts = np.maximum(level, breakaway) > 0.0
+        _refuse("breakaway", breakaway, acts & (breakaway < level), "must be at least the level")
+        return np.asarray(acts)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class JointStop(Force):
+class JointStop(JointForce):
     """A spring and a damper beyond the ends of a joint's range; they store potential energy and dissipate.
 
     Stiffness and damping rise smoothly from 0 to their full values over the first ``width`` beyond an end, so that
@@ -245,34 +258,26 @@ class JointStop(Force):
     lower: JointValues | None = None
     upper: JointValues | None = None
     width: JointValues = 0.01
+    columns = ("lower", "upper", "stiffness", "damping", "width")
 
-    def bind(self, robot: Robot) -> tuple[Element, ...]:
-        stiffness = not_negative("stiffness", self.stiffness, robot)
-        damping = not_negative("damping", self.damping, robot)
-        own_lower, own_upper = robot.position_limits
-        lower = own_lower if self.lower is None else _ends("lower", self.lower, robot, -np.inf)
-        upper = own_upper if self.upper is None else _ends("upper", self.upper, robot, np.inf)
-        given = (stiffness > 0.0) | (damping > 0.0)
+    def acts(self, numbers: dict[str, Floats], robot: Robot) -> Mask:
+        ends = zip(("lower", "upper"), robot.position_limits, strict=True)
+        lower, upper = (numbers.setdefault(name, own) for name, own in ends)
+        given = (numbers["stiffness"] > 0.0) | (numbers["damping"] > 0.0)
         acts = given & (np.isfinite(lower) | np.isfinite(upper))
-        endless = [name for name, wanted, has in zip(robot.joint_names, given, acts, strict=True) if wanted and not has]
+        endless = np.array(robot.joint_names)[given & ~acts]
         # One number for all joints skips those without limits, such as continuous joints.
-        if endless and (isinstance(self.stiffness, Mapping) or not acts.any()):
+        if endless.size and (isinstance(self.stiffness, Mapping) or not acts.any()):
             raise InputError(
-                f"JointStop: {robot.name} has no position limits for {', '.join(map(repr, endless))}: give lower= and "
-                "upper="
+                f"JointStop: {robot.name} has no position limits for {', '.join(map(repr, endless.tolist()))}: give "
+                "lower= and upper="
             )
-        if (crossed := acts & ~(lower < upper)).any():
-            c = int(np.argmax(crossed))
-            raise InputError(
-                f"JointStop: the lower end of joint {robot.joint_names[c]!r}, {lower[c]:g}, is not below its upper "
-                f"end, {upper[c]:g}"
-            )
-        width = _positive("width", self.width, robot, acts)
-        return tuple(_elements("JointStop", acts, lower, upper, stiffness, damping, width))
+        _refuse("lower", lower, acts & ~(lower < upper), "must be below the upper end")
+        return np.asarray(acts)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PositionServo(Force):
+class PositionServo(JointForce):
     """Position servos: the control of a joint is its target position [rad or m] in place of a force.
 
     The drive's force is S(stiffness * (u - q) - damping * v) throughout a step, not only at its start, so implicit
@@ -288,14 +293,6 @@ class PositionServo(Force):
     stiffness: JointValues
     damping: JointValues = 0.0
     effort: JointValues = np.inf
-
-    def bind(self, robot: Robot) -> tuple[Element, ...]:
-        stiffness = not_negative("stiffness", self.stiffness, robot)
-        damping = not_negative("damping", self.damping, robot)
-        effort = _ends("effort", self.effort, robot, np.inf)
-        acts = stiffness > 0.0
-        _refuse("effort", effort, acts & ~(effort > 0.0), "must be > 0")
-        return tuple(_elements("PositionServo", acts, stiffness, damping, effort))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -316,8 +313,7 @@ class FrameWrench(Force):
     axes: Literal["world", "frame"] = "world"
 
     def bind(self, robot: Robot) -> tuple[Coupling, ...]:
-        if not is_one_of(self.axes, ("world", "frame")):
-            raise InputError(f"axes must be 'world' or 'frame', got {self.axes!r}")
+        word("axes", self.axes, ("world", "frame"))
         wrench = finite_array("wrench", self.wrench, (6,))
         if not isinstance(self.frame, str | tuple):
             raise InputError(f"frame must be a frame's name or (name, place), got {shown(self.frame)}")
@@ -367,39 +363,34 @@ class FrameSpring(Force):
     rest_rotation: ArrayLike | None = None
 
     def bind(self, robot: Robot) -> tuple[Coupling, ...]:
-        return (*self._of_points(robot), *self._of_turning(robot))
-
-    def _of_turning(self, robot: Robot) -> tuple[Coupling, ...]:
-        """One spring between each axis of frame a and its rest direction in b."""
-        rest = np.eye(3) if self.rest_rotation is None else rotation_matrix("rest_rotation", self.rest_rotation)
+        (a, here, x), (b, there, y) = ends_of(self, robot)
+        found = self._of_points()
+        springs = [Coupling(kind, a, b, (*x.tolist(), *y.tolist(), *numbers)) for kind, numbers in found]
+        # One spring between each axis of frame a and its rest direction in b.
+        R = np.eye(3) if self.rest_rotation is None else rotation_matrix("rest_rotation", self.rest_rotation)
         if self.rotational_stiffness is None:
             if self.rest_rotation is not None:
                 raise InputError("rest_rotation is of a rotational_stiffness, and there is none")
-            return ()
+            return tuple(springs)
         about = _along_axes("rotational_stiffness", self.rotational_stiffness)
-        (a, here, _), (b, there, _) = point_of("a", self.a, robot), point_of("b", self.b, robot)
-        _ends_of(self, robot)
-        weights, slack = 0.5 * about.sum() - about, there @ rest
-        return tuple(
-            Coupling("FrameTurnSpring", a, b, (*here[:, i].tolist(), *slack[:, i].tolist(), float(weights[i])))
-            for i in range(3)
-            if weights[i]
-        )
+        weights, slack = 0.5 * about.sum() - about, there @ R
+        for i in np.flatnonzero(weights):
+            axes = (*here[:, i].tolist(), *slack[:, i].tolist())
+            springs.append(Coupling("FrameTurnSpring", a, b, (*axes, float(weights[i]))))
+        return tuple(springs)
 
-    def _of_points(self, robot: Robot) -> tuple[Coupling, ...]:
-        bodies, places = _ends_of(self, robot)
-        stiffness = _along_axes("stiffness", self.stiffness)
-        rest = as_floats("rest", self.rest)
+    def _of_points(self) -> list[tuple[str, list[float]]]:
+        """The kind of the spring between the points, and its numbers; empty for none."""
+        stiffness, rest = _along_axes("stiffness", self.stiffness), as_floats("rest", self.rest)
         if rest.shape not in ((), (3,)) or not np.isfinite(rest).all() or (rest.ndim == 0 and rest < 0.0):
             raise InputError(f"rest must be a length >= 0, or finite along three axes (3,), got {shown(rest)}")
         if not stiffness.any():
-            return ()
+            return []
         if rest.ndim == 0 and rest > 0.0:
             if np.ndim(self.stiffness):
                 raise InputError("a spring with a length at rest has one stiffness, and not one along each axis")
-            return (Coupling("FrameLengthSpring", *bodies, (*places, float(stiffness[0]), float(rest))),)
-        slack = np.broadcast_to(rest, (3,))
-        return (Coupling("FrameSpring", *bodies, (*places, *stiffness.tolist(), *slack.tolist())),)
+            return [("FrameLengthSpring", [stiffness[0], float(rest)])]
+        return [("FrameSpring", [*stiffness.tolist(), *np.broadcast_to(rest, (3,)).tolist()])]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -422,15 +413,13 @@ class FrameDamper(Force):
     rotational_damping: ArrayLike | None = None
 
     def bind(self, robot: Robot) -> tuple[Coupling, ...]:
-        bodies, places = _ends_of(self, robot)
+        (a, _, x), (b, _, y) = ends_of(self, robot)
         found = []
-        for kind, name, given in (
-            ("FrameDamper", "damping", self.damping),
-            ("FrameTurnDamper", "rotational_damping", self.rotational_damping),
-        ):
+        for kind, name in (("FrameDamper", "damping"), ("FrameTurnDamper", "rotational_damping")):
+            given = getattr(self, name)
             damping = np.zeros(3) if given is None else _along_axes(name, given)
             if damping.any():
-                found.append(Coupling(kind, *bodies, (*places, *damping.tolist())))
+                found.append(Coupling(kind, a, b, (*x.tolist(), *y.tolist(), *damping.tolist())))
         return tuple(found)
 
 
@@ -453,20 +442,22 @@ def point_of(name: str, point: Any, robot: Robot) -> tuple[int, Floats, Floats]:
     return body, turned, at + turned @ place
 
 
-def require_movable(owner: object, a: int, b: int, robot: Robot) -> None:
-    """Refuse a force or constraint between bodies ``a`` and ``b`` of :func:`point_of` if both are fixed."""
-    if a < 0 and b < 0:
+End: TypeAlias = tuple[int, Floats, Floats]
+
+
+def ends_of(owner: Any, robot: Robot) -> tuple[End, End]:
+    """:func:`point_of` of the ends a and b of a force or constraint.
+
+    Raises:
+        InputError: Both are fixed, in the world or to the base.
+    """
+    a, b = point_of("a", owner.a, robot), point_of("b", owner.b, robot)
+    if a[0] < 0 and b[0] < 0:
         raise InputError(
             f"{type(owner).__name__}: both ends are fixed, in the world or to the base of robot {robot.name!r}: no "
             "joint moves one"
         )
-
-
-def _ends_of(force: FrameSpring | FrameDamper, robot: Robot) -> tuple[tuple[int, int], tuple[float, ...]]:
-    """The bodies at both ends, and the points on them, concatenated (6,)."""
-    (a, _, here), (b, _, there) = point_of("a", force.a, robot), point_of("b", force.b, robot)
-    require_movable(force, a, b, robot)
-    return (a, b), (*here.tolist(), *there.tolist())
+    return a, b
 
 
 def _along_axes(name: str, value: ArrayLike) -> Floats:
@@ -536,46 +527,13 @@ def forces_of(given: Force | Sequence[Force]) -> tuple[Force, ...]:
     return tuple_of("forces", given, Force)
 
 
-def not_negative(name: str, value: JointValues, robot: Robot) -> Floats:
-    """``value`` as numbers >= 0 for each joint (n,).
-
-    Raises:
-        InputError: As :func:`varpin.support.checks.joint_array`, or a number is negative.
-    """
-    values = joint_array(name, value, robot.joint_names, uniform=True)
+def not_negative(name: str, values: Floats) -> Floats:
+    """``values`` for each joint (n,) if none is negative; an InputError otherwise."""
     return _refuse(name, values, values < 0.0, "must be >= 0")
 
 
-def _positive(name: str, value: JointValues, robot: Robot, needed: NDArray[np.bool_]) -> Floats:
-    """``value`` for each joint (n,), > 0 where it is needed."""
-    values = joint_array(name, value, robot.joint_names, uniform=True)
-    return _refuse(name, values, needed & ~(values > 0.0), "must be > 0")
-
-
-def _ends(name: str, value: JointValues, robot: Robot, absent: float) -> Floats:
-    """A limit for each joint (n,), ``absent`` for joints without one."""
-    joints = robot.joint_names
-    if isinstance(value, Mapping):
-        values = np.full(len(joints), absent)
-        for joint, number in value.items():
-            if joint not in joints:
-                raise UnknownJoint(str(joint), joints, name)
-            values[joints.index(joint)] = as_floats(f"{name}[{joint!r}]", number)
-    else:
-        given = as_floats(name, value)
-        if given.shape not in ((), (len(joints),)):
-            raise InputError(f"{name} must be one number or have shape ({len(joints)},), got {given.shape}")
-        values = np.array(np.broadcast_to(given, (len(joints),)))
-    return _refuse(name, values, np.isnan(values) | (values == -absent), f"must be a number, or {absent} for none")
-
-
-def _refuse(name: str, values: Floats, wrong: NDArray[np.bool_], what: str) -> Floats:
+def _refuse(name: str, values: Floats, wrong: Mask, what: str) -> Floats:
     if wrong.any():
         c = int(np.argmax(wrong))
         raise InputError(f"{name}[{c}] is {values[c]}; it {what}")
     return values
-
-
-def _elements(kind: str, acts: NDArray[np.bool_], *columns: Floats) -> Iterator[Element]:
-    for c in np.flatnonzero(acts):
-        yield Element(kind, int(c), tuple(float(column[c]) for column in columns))

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -28,8 +28,8 @@ from varpin.support.checks import (
     count,
     finite_array,
     joint_array,
-    require_finite,
     returned,
+    tuple_of,
 )
 from varpin.support.differences import slopes
 from varpin.support.frozen import Frozen
@@ -63,79 +63,78 @@ class Noise(ABC):
     """A diffusion model. A subclass provides ``bind``, which applies it to a robot."""
 
     @abstractmethod
-    def bind(self, actuation: Floats) -> BoundNoise:
-        """The model on a robot of n coordinates and m controls, with its actuation matrix (n, m).
+    def bind(self, actuation: Floats, joints: Sequence[str]) -> BoundNoise:
+        """The model on a robot of n ``joints`` and m controls, with its actuation matrix (n, m).
 
         Raises:
             InputError: Its parameters do not fit the robot.
+            UnknownJoint: It names a joint that the robot does not have.
         """
 
     def __add__(self, other: Noise) -> NoiseSum:
         if not isinstance(other, Noise):
             return NotImplemented
-        return NoiseSum((*_terms(self), *_terms(other)))
+        return NoiseSum(models_of((self, other)))
 
 
-class BoundNoise(Frozen, ABC):
-    """A noise model on a robot."""
+@dataclass(frozen=True, eq=False)
+class BoundNoise(Frozen):
+    """Noise models on a robot: k independent processes side by side.
+
+    Attributes:
+        arrays: Fields in the form of the core, zero for the processes of a :class:`CustomNoise`.
+        own: Each :class:`CustomNoise`, with the index of its first process.
+    """
+
+    arrays: Diffusion
+    own: tuple[tuple[int, CustomNoise], ...] = ()
 
     @property
-    @abstractmethod
     def processes(self) -> int:
         """k, the number of Wiener processes."""
+        return int(self.arrays.constant.shape[1])
 
     @property
     def velocity_dependent(self) -> bool:
         """Whether a field depends on the velocity, so that the Stratonovich and Ito equations differ."""
-        return False
+        return any(noise.dv is not None for _, noise in self.own)
 
     @property
     def diffusion(self) -> Diffusion | None:
-        """The fields in the form of the core, or None for fields in Python."""
-        return None
+        """The fields in the form of the core, or None if some are in Python."""
+        return None if self.own else self.arrays
 
     @property
     def sloped(self) -> Integers:
         """The processes whose strength depends on the control; they see its slope within a step."""
-        if self.diffusion is None:
-            return np.arange(self.processes)
-        return np.flatnonzero(self.diffusion.control.any(axis=(0, 2)))
+        depends = np.array(self.arrays.control.any(axis=(0, 2)))
+        for first, noise in self.own:
+            depends[first : first + noise.processes] = noise.du is not None
+        return np.flatnonzero(depends)
 
-    def curvature(self, weight: Floats) -> Floats:
-        """Second derivatives of sum_i weight_i . F_i in q (N, n, n), weights (N, n, k); zero for fields in Python."""
-        return np.zeros((len(weight), weight.shape[1], weight.shape[1]))
-
-    @abstractmethod
     def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:
-        """F and its derivatives at q (N, n), v (N, n), u (N, m); ``start`` (n,) is q at the start of the motion."""
+        """F and its derivatives at q (N, n), v (N, n), u (N, m); ``start`` (n,) is q at the start of the motion.
 
-
-@dataclass(frozen=True, eq=False)
-class CompiledFields(BoundNoise):
-    """Fields in the form of the core: constant, linear in u, quadratic in q."""
-
-    arrays: Diffusion
-
-    @property
-    def diffusion(self) -> Diffusion:
-        return self.arrays
-
-    @property
-    def processes(self) -> int:
-        return int(self.arrays.constant.shape[1])
-
-    def curvature(self, weight: Floats) -> Floats:
-        second: Floats = 2.0 * (self.arrays.quadratic * weight).sum(axis=2)
-        return second[:, :, None] * np.eye(second.shape[1])
-
-    def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:  # noqa: ARG002
+        Raises:
+            NoiseFieldError: A function of a custom noise raised, or its result is no finite array of the right shape.
+        """
         arrays = self.arrays
         n, k = arrays.constant.shape
         offset = q[:, :, None] - np.where(np.isnan(arrays.center), start[:, None], arrays.center)
         F = arrays.constant + np.einsum("ikm,Nm->Nik", arrays.control, u) + arrays.quadratic * offset**2
         Fq = np.zeros((len(q), n, k, n))
         Fq[:, np.arange(n), :, np.arange(n)] = np.moveaxis(2.0 * arrays.quadratic * offset, 1, 0)
-        return Fields(F, Fq, None, np.broadcast_to(arrays.control, (len(q), *arrays.control.shape)))
+        Fv = np.zeros_like(Fq) if self.velocity_dependent else None
+        Fu = np.broadcast_to(arrays.control, (len(q), *arrays.control.shape))
+        Fu = Fu.copy() if self.own else Fu
+        for first, noise in self.own:
+            # Copies, so that a field that writes into its arguments cannot change the state of a motion.
+            points = list(zip(q.copy(), v.copy(), u.copy(), strict=True))
+            columns = slice(first, first + noise.processes)
+            for name, values in (("field", F), ("dq", Fq), ("dv", Fv), ("du", Fu)):
+                if getattr(noise, name) is not None and values is not None:
+                    values[:, :, columns] = noise.at(name, points, values[0, :, columns].shape)
+        return Fields(F, Fq, Fv, Fu)
 
 
 def over_steps(
@@ -173,52 +172,10 @@ def over_steps(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class CompositeFields(BoundNoise):
-    """The concatenated processes of several bound models, some of them in Python."""
-
-    parts: tuple[BoundNoise, ...]
-
-    @property
-    def processes(self) -> int:
-        return sum(part.processes for part in self.parts)
-
-    @property
-    def velocity_dependent(self) -> bool:
-        return any(part.velocity_dependent for part in self.parts)
-
-    @property
-    def sloped(self) -> Integers:
-        first = np.cumsum([0, *(part.processes for part in self.parts)])
-        return np.concatenate([start + part.sloped for start, part in zip(first[:-1], self.parts, strict=True)])
-
-    def curvature(self, weight: Floats) -> Floats:
-        ends = np.cumsum([part.processes for part in self.parts])
-        columns = np.split(weight, ends[:-1], axis=2)
-        total: Floats = sum(
-            (part.curvature(column) for part, column in zip(self.parts, columns, strict=True)),
-            np.zeros((len(weight), weight.shape[1], weight.shape[1])),
-        )
-        return total
-
-    def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:
-        parts = [part.fields(q, v, u, start) for part in self.parts]
-        Fv = None
-        if any(part.Fv is not None for part in parts):
-            Fv = np.concatenate([np.zeros_like(part.Fq) if part.Fv is None else part.Fv for part in parts], axis=2)
-        return Fields(
-            np.concatenate([part.F for part in parts], axis=2),
-            np.concatenate([part.Fq for part in parts], axis=2),
-            Fv,
-            np.concatenate([part.Fu for part in parts], axis=2),
-        )
-
-
-def _compiled(n: int, m: int, k: int, **given: Floats) -> CompiledFields:
-    """Fields in the form of the core, zero where they are not given."""
+def _noise(n: int, m: int, k: int, **given: Floats) -> BoundNoise:
+    """Noise whose fields in the form of the core are zero where they are not given."""
     nothing = {"constant": (n, k), "control": (n, k, m), "quadratic": (n, k), "center": (n, k)}
-    values = {name: given.get(name, np.zeros(shape)) for name, shape in nothing.items()}
-    return CompiledFields(Diffusion(**{name: np.ascontiguousarray(value) for name, value in values.items()}))
+    return BoundNoise(Diffusion(**{name: given.get(name, np.zeros(shape)) for name, shape in nothing.items()}))
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,14 +189,14 @@ class AdditiveNoise(Noise):
 
     intensity: JointValues
 
-    def bind(self, actuation: Floats) -> CompiledFields:
-        n, m = actuation.shape
-        values = require_finite("AdditiveNoise intensity", as_floats("AdditiveNoise intensity", self.intensity))
-        if values.ndim == 2:
-            F = finite_array("AdditiveNoise intensity", values, (n, values.shape[1]))
+    def bind(self, actuation: Floats, joints: Sequence[str]) -> BoundNoise:
+        name, (n, m) = "AdditiveNoise intensity", actuation.shape
+        given = self.intensity if isinstance(self.intensity, Mapping) else as_floats(name, self.intensity)
+        if isinstance(given, np.ndarray) and given.ndim == 2:
+            F = finite_array(name, given, (n, given.shape[1]))
         else:
-            F = np.diag(broadcast_array("AdditiveNoise intensity", values, n))
-        return _compiled(n, m, F.shape[1], constant=F)
+            F = np.diag(joint_array(name, given, joints, uniform=True))
+        return _noise(n, m, F.shape[1], constant=F)
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,16 +210,16 @@ class ControlNoise(Noise):
 
     intensity: ArrayLike
 
-    def bind(self, actuation: Floats) -> CompiledFields:
-        n, m = actuation.shape
-        values = require_finite("ControlNoise intensity", as_floats("ControlNoise intensity", self.intensity))
-        if values.ndim == 3:
-            field = finite_array("ControlNoise intensity", values, (n, values.shape[1], m))
+    def bind(self, actuation: Floats, joints: Sequence[str]) -> BoundNoise:  # noqa: ARG002
+        name, (n, m) = "ControlNoise intensity", actuation.shape
+        field = as_floats(name, self.intensity)
+        if field.ndim == 3:
+            field = finite_array(name, field, (n, field.shape[1], m))
         else:
-            strength = broadcast_array("ControlNoise intensity", values, m)
+            strength = broadcast_array(name, field, m)
             field = np.zeros((n, m, m))
             field[:, np.arange(m), np.arange(m)] = actuation * strength
-        return _compiled(n, m, field.shape[1], control=field)
+        return _noise(n, m, field.shape[1], control=field)
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,11 +234,13 @@ class StateNoise(Noise):
     intensity: JointValues
     center: JointValues | None = None
 
-    def bind(self, actuation: Floats) -> CompiledFields:
+    def bind(self, actuation: Floats, joints: Sequence[str]) -> BoundNoise:
         n, m = actuation.shape
-        strength = np.diag(broadcast_array("StateNoise intensity", self.intensity, n))
-        center = np.full(n, np.nan) if self.center is None else broadcast_array("StateNoise center", self.center, n)
-        return _compiled(n, m, n, quadratic=strength, center=np.repeat(center[:, None], n, axis=1))
+        strength = joint_array("StateNoise intensity", self.intensity, joints, uniform=True)
+        center = np.full(n, np.nan)
+        if self.center is not None:
+            center = joint_array("StateNoise center", self.center, joints, uniform=True)
+        return _noise(n, m, n, quadratic=np.diag(strength), center=np.repeat(center[:, None], n, axis=1))
 
 
 Field = Callable[[Floats, Floats, Floats], ArrayLike]
@@ -308,84 +267,41 @@ class CustomNoise(Noise):
     du: Field | None = None
     check: bool = False
 
-    def bind(self, actuation: Floats) -> CustomFields:
+    def bind(self, actuation: Floats, joints: Sequence[str]) -> BoundNoise:  # noqa: ARG002
         count("CustomNoise processes", self.processes)
         for name in ("field", "dq", "dv", "du"):
             value = getattr(self, name)
             if not callable(value) and (value is not None or name == "field"):
                 raise InputError(f"CustomNoise {name} must be a function of (q, v, u), got {value!r}")
-        bound = CustomFields(self, *actuation.shape)
+        n, m = actuation.shape
         if self.check:
-            bound.check()
-        return bound
+            self._compare(n, m)
+        return BoundNoise(_noise(n, m, self.processes).arrays, ((0, self),))
 
-
-@dataclass(frozen=True, eq=False)
-class CustomFields(BoundNoise):
-    """A :class:`CustomNoise` on a robot."""
-
-    noise: CustomNoise
-    n: int
-    m: int
-
-    @property
-    def processes(self) -> int:
-        return self.noise.processes
-
-    @property
-    def velocity_dependent(self) -> bool:
-        return self.noise.dv is not None
-
-    @property
-    def sloped(self) -> Integers:
-        return np.arange(0 if self.noise.du is None else self.processes)
-
-    def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:  # noqa: ARG002
-        """See :meth:`BoundNoise.fields`.
+    def at(self, name: str, points: Sequence[tuple[Floats, Floats, Floats]], shape: tuple[int, ...]) -> Floats:
+        """Values (N, *shape) of one of the functions at N points (q, v, u); 0 for a function that is left out.
 
         Raises:
-            NoiseFieldError: A function raised, or its result is not a finite array of the right shape.
+            NoiseFieldError: It raised, or its result is not a finite array of this shape.
         """
-        shape = (self.n, self.processes)
-        # Copies, so that a field that writes into its arguments cannot change the state of a motion.
-        points = list(zip(q.copy(), v.copy(), u.copy(), strict=True))
-        noise = self.noise
-        return Fields(
-            self._evaluate("field", noise.field, points, shape),
-            self._evaluate("dq", noise.dq, points, (*shape, self.n)),
-            None if noise.dv is None else self._evaluate("dv", noise.dv, points, (*shape, self.n)),
-            self._evaluate("du", noise.du, points, (*shape, self.m)),
-        )
-
-    def _evaluate(
-        self, name: str, function: Field | None, points: Sequence[tuple[Floats, Floats, Floats]], shape: tuple[int, ...]
-    ) -> Floats:
+        function, what = getattr(self, name), f"CustomNoise {name}(q, v, u)"
         if function is None:
             return np.zeros((len(points), *shape))
-        what = f"CustomNoise {name}(q, v, u)"
-        rows = [returned(what, partial(function, *at), shape, error=NoiseFieldError) for at in points]
-        return np.array(rows)
+        return np.array([returned(what, partial(function, *at), shape, error=NoiseFieldError) for at in points])
 
-    def check(self) -> None:
-        """Compare the derivatives with differences at three seeded random points.
-
-        Raises:
-            InputError: A derivative differs; the message names it, the point and the error.
-        """
-        rng, n, shape = np.random.default_rng(0), self.n, (self.n, self.processes)
+    def _compare(self, n: int, m: int) -> None:
+        """Refuse derivatives that differ from differences at three seeded random points."""
+        rng, shape = np.random.default_rng(0), (n, self.processes)
         for _ in range(3):
-            q, v, u = (rng.normal(size=size) for size in (n, n, self.m))
-            given = self.fields(q[None], v[None], u[None], q)
+            q, v, u = (rng.normal(size=size) for size in (n, n, m))
 
             def field(x: Floats) -> Floats:
-                at = x[:n], x[n : 2 * n], x[2 * n :]
-                value: Floats = self._evaluate("field", self.noise.field, [at], shape)[0]
+                value: Floats = self.at("field", [(x[:n], x[n : 2 * n], x[2 * n :])], shape)[0]
                 return value
 
             found = np.split(slopes(field, np.concatenate([q, v, u]), 1e-3), [n, 2 * n], axis=2)
-            derivatives = given.Fq, np.zeros_like(given.Fq) if given.Fv is None else given.Fv, given.Fu
-            for name, derivative, differences in zip(("dq", "dv", "du"), derivatives, found, strict=True):
-                off = np.abs(derivative[0] - differences)
+            for name, differences in zip(("dq", "dv", "du"), found, strict=True):
+                off = np.abs(self.at(name, [(q, v, u)], differences.shape)[0] - differences)
                 wrong = off > 1e-6 * np.maximum(1.0, np.abs(differences))
                 if wrong.any():
                     raise InputError(
@@ -400,70 +316,43 @@ class NoiseSum(Noise):
 
     terms: tuple[Noise, ...]
 
-    def bind(self, actuation: Floats) -> BoundNoise:
-        return _together([term.bind(actuation) for term in self.terms])
+    def bind(self, actuation: Floats, joints: Sequence[str]) -> BoundNoise:
+        return bind(self.terms, actuation, joints)
 
 
-def _named(noise: Noise, joints: Sequence[str]) -> Noise:
-    """The model with arrays in the order of ``joints`` in place of numbers by joint name.
+def models_of(noise: Noise | Sequence[Noise] | None) -> tuple[Noise, ...]:
+    """The models of the argument of a scene, and of sums among them.
 
     Raises:
-        UnknownJoint: A name is not in ``joints``.
+        InputError: It is neither a noise model nor a sequence of them.
     """
-    if isinstance(noise, NoiseSum):
-        return NoiseSum(tuple(_named(term, joints) for term in noise.terms))
-    given: dict[str, Floats] = {}
-    for item in fields(noise) if is_dataclass(noise) else ():  # type: ignore[var-annotated]
-        value = getattr(noise, item.name)
-        if "JointValues" in str(item.type) and isinstance(value, Mapping):
-            given[item.name] = joint_array(f"{type(noise).__name__} {item.name}", value, joints)
-    return replace(noise, **given) if given else noise  # type: ignore[type-var]
+    models = () if noise is None else tuple_of("noise models", noise, Noise)
+    return tuple(term for model in models for term in (model.terms if isinstance(model, NoiseSum) else (model,)))
 
 
-def _together(parts: Sequence[BoundNoise]) -> BoundNoise:
-    """The concatenated processes of several bound models; in the form of the core if all are."""
-    arrays = [part.diffusion for part in parts if part.diffusion is not None]
-    if len(parts) == 1 or len(arrays) < len(parts):
-        return parts[0] if len(parts) == 1 else CompositeFields(tuple(parts))
-    return CompiledFields(Diffusion(*(np.concatenate(columns, axis=1) for columns in zip(*arrays, strict=True))))
-
-
-def _terms(noise: Noise) -> tuple[Noise, ...]:
-    return noise.terms if isinstance(noise, NoiseSum) else (noise,)
-
-
-def _sound(model: Noise, bound: BoundNoise, n: int, m: int) -> BoundNoise:
-    """``bound``, the result of a model's ``bind``, checked for type, shapes and finite values."""
-    name = type(model).__name__
-    if not isinstance(bound, BoundNoise):
-        raise InputError(f"bind of {name} must return a BoundNoise, got {type(bound).__name__}")
-    k = count(f"processes of {name}", bound.processes)
-    if bound.diffusion is not None:
-        shapes = ((n, k), (n, k, m), (n, k), (n, k))
-        for field, array, shape in zip(Diffusion._fields, bound.diffusion, shapes, strict=True):
-            if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
-                raise InputError(f"the diffusion of {name} has a field {field!r} that is no float64 array {shape}")
-            # NaN in a center means the initial configuration.
-            if not (np.isfinite(array).all() or field == "center"):
-                raise InputError(f"the diffusion of {name} has a field {field!r} that is not finite")
-    return bound
-
-
-def bind(noise: Noise | Sequence[Noise] | None, actuation: Floats, joints: Sequence[str] | None = None) -> BoundNoise:
-    """No noise model, one, or several, on a robot with this actuation matrix (n, m) and these joint names.
+def bind(models: Sequence[Noise], actuation: Floats, joints: Sequence[str]) -> BoundNoise:
+    """Noise models on a robot with this actuation matrix (n, m) and these joints; those of users are checked here.
 
     Raises:
         UnknownJoint: A model names a joint that is not in ``joints``.
-        InputError: Not a noise model, or parameters that do not fit the robot.
+        InputError: Parameters do not fit the robot, or ``bind`` of a model returned arrays that do not.
     """
-    if noise is None or (isinstance(noise, Sequence) and not noise):
-        n, m = actuation.shape
-        return _compiled(n, m, 0)
-    models: Sequence[Noise] = [noise] if isinstance(noise, Noise) or not isinstance(noise, Sequence) else noise
-    bound = []
+    n, m = actuation.shape
+    own: list[tuple[int, CustomNoise]] = []
+    parts = [_noise(n, m, 0)]
     for model in models:
-        if not isinstance(model, Noise):
-            raise InputError(f"noise must be a varpin noise model or several of them, got {type(model).__name__}")
-        known = model if joints is None else _named(model, joints)
-        bound.append(_sound(known, known.bind(actuation), *actuation.shape))
-    return _together(bound)
+        part, name = model.bind(actuation, joints), type(model).__name__
+        if not isinstance(part, BoundNoise):
+            raise InputError(f"bind of {name} must return a BoundNoise, got {type(part).__name__}")
+        k = part.processes
+        for field, array, shape in zip(
+            Diffusion._fields, part.arrays, ((n, k), (n, k, m), (n, k), (n, k)), strict=True
+        ):
+            # NaN in a center means the initial configuration.
+            known = np.nan_to_num(array, posinf=np.inf, neginf=-np.inf) if field == "center" else array
+            finite_array(f"{field} of {name}", known, shape)
+        before = sum(earlier.processes for earlier in parts)
+        own += [(before + first, noise) for first, noise in part.own]
+        parts.append(part)
+    columns = zip(*(part.arrays for part in parts), strict=True)
+    return BoundNoise(Diffusion(*(np.concatenate(column, axis=1) for column in columns)), tuple(own))

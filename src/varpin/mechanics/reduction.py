@@ -13,7 +13,7 @@ from varpin.arrays import Floats, Integers, Mask
 from varpin.core.arrays import Coupling, Diffusion
 from varpin.errors import InputError, UnknownJoint
 from varpin.mechanics.forces import Force, of_kind
-from varpin.mechanics.noise import BoundNoise, CompiledFields, Noise
+from varpin.mechanics.noise import BoundNoise
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot, combine
 from varpin.model.loading import hold_joints
@@ -50,11 +50,6 @@ class Required:
         return len(self.joints) + len(self.locked) + len(self.idle)
 
     @property
-    def saved(self) -> float:
-        """Saved share of the linear algebra of a plan, whose work grows with the cube of the number of joints."""
-        return 1.0 - sum(len(part) ** 3 for part in self.parts) / self.described**3
-
-    @property
     def rows(self) -> list[tuple[str, str]]:
         """The report as names and texts."""
         rows = [("computed", f"{len(self.joints)} of {self.described}: {listed(self.joints)}")]
@@ -65,11 +60,7 @@ class Required:
             rows.append(("planned apart", "; ".join(listed(part) for part in self.parts)))
         if self.coupled:
             rows.append(("planned together", self.coupled))
-        return [
-            *rows,
-            *self.terms.items(),
-            ("saved", f"{100 * self.saved:.0f}% of a plan's linear algebra, by counting"),
-        ]
+        return [*rows, *self.terms.items()]
 
     def _repr_html_(self) -> str:
         return facts("What is computed", self.rows)
@@ -173,9 +164,8 @@ def without(scene: Scene, joints: Mapping[str, float] | Collection[str]) -> Scen
         damping=0.0,
         forces=[part for part in (_part(force, scene, keep, held) for force in scene.forces) if part is not None],
         actuation=actuation[keep],
-        noise=_Rows(_rows(noise, keep, columns)),
         constraints=(),
-    )
+    ).changed(noise=_noise_of(noise, keep, columns))
 
 
 def driving(scene: Scene, held: Collection[str]) -> Integers:
@@ -215,21 +205,11 @@ def _values(value: Any, keep: Integers, held: Mapping[str, float]) -> Any:
     return value[keep] if np.ndim(value) == 1 else value
 
 
-def _rows(fields: Diffusion, keep: Integers, columns: Integers) -> CompiledFields:
+def _noise_of(fields: Diffusion, keep: Integers, columns: Integers) -> BoundNoise:
     """The processes that act on the coordinates ``keep`` in proportion to nothing but the controls ``columns``."""
     acts = (
         fields.constant[keep].any(axis=0) | fields.quadratic[keep].any(axis=0) | fields.control[keep].any(axis=(0, 2))
     )
     rows = np.ix_(keep, acts)
     parts = (fields.constant[rows], fields.control[np.ix_(keep, acts, columns)], fields.quadratic[rows])
-    return CompiledFields(Diffusion(*map(np.ascontiguousarray, (*parts, fields.center[rows]))))
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows(Noise):
-    """Noise whose fields are known."""
-
-    bound: CompiledFields
-
-    def bind(self, actuation: Floats) -> BoundNoise:  # noqa: ARG002
-        return self.bound
+    return BoundNoise(Diffusion(*map(np.ascontiguousarray, (*parts, fields.center[rows]))))

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,7 +45,7 @@ from varpin.mechanics.forces import (
     not_negative,
     of_kind,
 )
-from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, NoiseSum, bind
+from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, bind, models_of
 from varpin.model import Robot, degrees_hint, require_robot
 from varpin.model.tree import block_ends, mechanism, path_coordinates
 from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array
@@ -60,35 +60,18 @@ logger = logging.getLogger(__name__)
 
 # Kinds of elements that are among the values as sums by joint.
 _SUMMED = ("Armature", "JointDamper", "JointSpring")
-# What a difference in values of these names is called.
-_WORDS = {
-    "center": "the robot's centres of mass",
-    "inertia": "the robot's inertias",
-    "rotation": "the axes of the robot's joints",
-    "translation": "the positions of the robot's joints",
-    "ratio": "the ratios of the robot's mimic joints",
-    "offset": "the offsets of the robot's mimic joints",
-}
+# Arrays of the robot's tree and sums by joint among the values.
+_OF_TREE = ("center", "inertia", "rotation", "translation", "ratio", "offset")
+_OF_JOINTS = ("damping", "stiffness", "rest", "armature")
 # Largest constraint residual of a given configuration, and of a start that is projected without request [m or rad].
 _OFF, CORRECTED = 1e-6, 0.02
 # Rank tolerance of the constraint Jacobian, relative to its largest singular value.
 _RANK = 1e-9
-# Most joints that a log message lists.
-_NAMED = 7
-_OF_JOINTS = ("damping", "stiffness", "rest", "armature")
 EARTH = (0.0, 0.0, -9.81)
 # Forces that act only if the scene has them, by their names in a report.
 _ABSENT: Mapping[str, type[Force]] = {"stops at joint limits": JointStop, "dry friction": CoulombFriction}
 # Depth to which a joint may press into a stop, in widths of the stop.
 _STOP_DEPTH = 2.0
-
-
-class Bounds(NamedTuple):
-    """Lower and upper limits (n,) of position, velocity and force of the joints; infinite where there is no limit."""
-
-    position: tuple[Floats, Floats]  # [rad or m]
-    velocity: tuple[Floats, Floats]  # [rad/s or m/s]
-    effort: tuple[Floats, Floats]  # [N m or N]
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -180,18 +163,19 @@ class Scene(Frozen):
             UnknownFrame: A force or constraint names a frame that the robot does not have.
         """
         require_robot(robot)
-        values: dict[str, Any] = {
-            "robot": robot,
-            "gravity": _gravity(gravity, robot),
-        }
+        values: dict[str, Any] = {"robot": robot, "gravity": _gravity(gravity, robot)}
         values |= _forces(robot, forces, damping, friction, stiffness, rest)
-        values["actuation"] = _served(robot, _actuation(robot, actuation), values["elements"])
-        _refuse_noisy_servos(noise, values["elements"], robot)
         values["constraints"] = given_constraints(robot, constraints)
         bound, order = joined([bound_constraint(constraint, robot) for constraint in values["constraints"]])
-        _require_positions(robot, values["actuation"], values["elements"], bound)
-        values["actuation"], bound = _with_rates(values["actuation"], bound)
-        values["noise"] = bind(noise, _of_forces(values["actuation"], bound), robot.joint_names)
+        inputs = [tie.follower for tie in filter(_is_input, bound.rows.ties)]
+        driven = _driven(robot, _actuation(robot, actuation), of_kind(values["elements"], "PositionServo"), inputs)
+        values["actuation"], bound = _with_rates(driven, bound)
+        models = models_of(noise)
+        _refuse_noisy_servos(models, values["elements"], robot)
+        # Kinematic inputs absorb all forces on their joints.
+        forced = values["actuation"].copy()
+        forced[inputs] = 0.0
+        values["noise"] = bind(models, forced, robot.joint_names)
         values |= {"bound_constraints": bound, "constraint_order": order, "announced": set()}
         for name, value in values.items():
             if isinstance(value, np.ndarray):
@@ -217,18 +201,13 @@ class Scene(Frozen):
     @property
     def terms(self) -> dict[str, str]:
         """What acts in the scene, in words by its subject."""
-        names, kinds = self.robot.joint_names, list(dict.fromkeys(map(type, self.forces)))
-        noise, processes = self.noise.diffusion, f"{self.processes} processes" if self.processes else "none"
-        if noise is not None and self.processes:
-            masks = (noise.constant.any(axis=0), noise.control.any(axis=(0, 2)), noise.quadratic.any(axis=0))
-            counts = zip(("additive", "control", "state"), map(np.count_nonzero, masks), strict=True)
-            processes = ", ".join(f"{kind} ({count} processes)" for kind, count in counts if count) or processes
+        names, kinds = self.robot.joint_names, set(map(type, self.forces))
         absent = [*(words for words, kind in _ABSENT.items() if kind not in kinds), "contact"]
         terms = {
             "gravity": f"{', '.join(f'{g:g}' for g in self.gravity)} m/s^2" if self.gravity.any() else "none",
             "damping": joints_with(self.damping, names),
             "springs": joints_with(self.stiffness, names),
-            "noise": processes,
+            "noise": f"{self.processes} processes" if self.processes else "none",
             "driven": ", ".join(np.array(names)[self.actuation.any(axis=1)].tolist()) or "none",
             "other forces": ", ".join(sorted(self._other_forces)) or "none",
             "not modelled": f"{', '.join(absent)}; shapes are read only for a replay",
@@ -333,10 +312,7 @@ class Scene(Frozen):
         if self.custom is not None:
             # The joints that the function couples are unknown.
             group[:] = 0
-        for coupling in self.couplings:
-            together = np.unique(group[self._moved_by([coupling])])
-            group[np.isin(group, together)] = together[0]
-        for coordinates in self._constrained():
+        for coordinates in [*(self._moved_by([coupling]) for coupling in self.couplings), *self._constrained()]:
             together = np.unique(group[coordinates])
             group[np.isin(group, together)] = together[0]
         label: NDArray[np.int64] = np.unique(group, return_inverse=True)[1].astype(np.int64)
@@ -414,38 +390,36 @@ class Scene(Frozen):
         """Matrix (m, n) of the smallest controls that give joint forces, or come closest: the pseudoinverse."""
         return np.asarray(np.linalg.pinv(self.actuation), dtype=np.float64)
 
-    @property
-    def _gear(self) -> Floats:
-        """Force (n,) per unit of a control that drives one joint only: 1, or the stiffness of its servo."""
-        gear = np.ones(self.robot.dof)
-        for servo in of_kind(self.elements, "PositionServo"):
-            gear[servo.coordinate] = servo.values[0]
-        return gear
-
     @cached_property
     def controls(self) -> int:
         """m, the number of controls."""
         return int(self.actuation.shape[1])
 
+    @property
+    def _servos(self) -> tuple[Element, ...]:
+        return of_kind(self.elements, "PositionServo")
+
     @cached_property
     def control_joints(self) -> tuple[str, ...] | None:
         """The joint of each of the m controls; None unless each is the force, or servo position, of a joint alone."""
-        joints = np.argmax(self.actuation, axis=0)
+        joints, gear = np.argmax(self.actuation, axis=0), np.eye(self.robot.dof)
+        for servo in self._servos:
+            gear[servo.coordinate] *= servo.values[0]
         alone = len(set(joints.tolist())) == self.controls
-        if not alone or not np.array_equal(self.actuation, np.diag(self._gear)[:, joints]):
+        if not alone or not np.array_equal(self.actuation, gear[:, joints]):
             return None
         return tuple(self.robot.joint_names[j] for j in joints)
 
     @cached_property
     def servo_joints(self) -> tuple[str, ...]:
         """The joints whose control is the target position of a servo."""
-        return tuple(self.robot.joint_names[servo.coordinate] for servo in of_kind(self.elements, "PositionServo"))
+        return tuple(self.robot.joint_names[servo.coordinate] for servo in self._servos)
 
     @cached_property
     def holding(self) -> Floats:
         """Matrix (m, n) of the neutral controls at q, ``holding @ q``: see :meth:`command_at`."""
         holding = np.zeros((self.controls, self.robot.dof))
-        for c in (*(servo.coordinate for servo in of_kind(self.elements, "PositionServo")), *self.inputs.values()):
+        for c in (*(servo.coordinate for servo in self._servos), *self.inputs.values()):
             holding[int(np.argmax(np.abs(self.actuation[c]))), c] = 1.0
         return holding
 
@@ -469,7 +443,7 @@ class Scene(Frozen):
         fields = self.diffusion
         return mechanism(
             self.robot.tree,
-            **(self._of_constrained_tree() if self.constraints else {}),
+            **(self._constrained_tree() if self.constraints else {}),
             group=self.group,
             groups=int(self.group.max()) + 1,
             ends=np.array([self.robot.dof]) if self.constraints else block_ends(self.group),
@@ -486,7 +460,7 @@ class Scene(Frozen):
             centers=fields.center,
         )
 
-    def _of_constrained_tree(self) -> dict[str, NDArray[np.int64]]:
+    def _constrained_tree(self) -> dict[str, NDArray[np.int64]]:
         """Fields of the tree that differ under constraints."""
         tree, rows = self.robot.tree, self.bound_constraints.rows
         # Constraints do work on light parts, so these have no energy balance of their own.
@@ -499,8 +473,11 @@ class Scene(Frozen):
         return changed | {"periodic": periodic}
 
     @cached_property
-    def bounds(self) -> Bounds:
-        """Limits of the robot's description, with position limits widened where a joint stop gives way."""
+    def bounds(self) -> Floats:
+        """Lower and upper limits (3, 2, n) of position, velocity and force of the joints; infinite where there is none.
+
+        They are those of the robot's description, of positions widened where a joint stop gives way.
+        """
         lower, upper = self.robot.position_limits
         # Crossed limits are a fault of the description, which inspect_robot reports.
         none = ~(lower < upper)
@@ -511,24 +488,14 @@ class Scene(Frozen):
             lower[c] = min(lower[c], first - _STOP_DEPTH * width) if first > lower[c] - width else lower[c]
             upper[c] = max(upper[c], last + _STOP_DEPTH * width) if last < upper[c] + width else upper[c]
         speed, effort = self.robot.velocity_limit, self.robot.effort_limit
-        return Bounds((lower, upper), (-speed, speed), (-effort, effort))
-
-    @cached_property
-    def bound_rows(self) -> Floats:
-        """:attr:`bounds` as an array (3, 2, n)."""
-        rows = np.array(self.bounds)
-        rows.setflags(write=False)
-        return rows
+        bounds = np.array([(lower, upper), (-speed, speed), (-effort, effort)])
+        bounds.setflags(write=False)
+        return bounds
 
     @cached_property
     def direct_efforts(self) -> bool:
         """Whether the motors' forces are those of the controls: there are neither servos nor kinematic inputs."""
         return not (self.servo_joints or self.inputs)
-
-    @cached_property
-    def bounded(self) -> tuple[bool, ...]:
-        """For each kind of :class:`Bounds`, whether any joint has one."""
-        return tuple(bool(np.isfinite(pair).any()) for pair in self.bounds)
 
     @cached_property
     def diffusion(self) -> Diffusion:
@@ -546,10 +513,8 @@ class Scene(Frozen):
         :class:`varpin.CustomNoise` is not stored.
         """
         tree = self.robot.tree
-        values = {
-            name: getattr(self, name) for name in ("gravity", "damping", "stiffness", "rest", "armature", "actuation")
-        }
-        values |= {name: getattr(tree, name) for name in _WORDS}
+        values = {name: getattr(self, name) for name in ("gravity", *_OF_JOINTS, "actuation")}
+        values |= {name: getattr(tree, name) for name in _OF_TREE}
         for kind in (kind for kind in ELEMENTS if kind not in _SUMMED):
             rows = [(each.coordinate, *each.values) for each in of_kind(self.elements, kind)]
             values[kind] = np.array(rows) if rows else np.zeros((0, 0))
@@ -634,7 +599,7 @@ class Scene(Frozen):
 
 def quiet(scene: Scene) -> Scene:
     """The scene without its noise."""
-    return scene.changed(noise=bind(None, scene.actuation)) if scene.processes else scene
+    return scene.changed(noise=bind((), scene.actuation, ())) if scene.processes else scene
 
 
 def joints_with(values: ArrayLike, names: Sequence[str]) -> str:
@@ -653,53 +618,31 @@ def _unowned(rows: ConstraintRows) -> ConstraintRows:
 def _numbers_of(rows: ConstraintRows) -> dict[str, Floats]:
     """The numbers of constraints by the names of :attr:`Scene.values`; kinds without rows are left out."""
     found: dict[str, Floats] = {}
-    if rows.products:
-        table = []
-        for product in rows.products:
-            numbers = [product.factor, product.constant]
-            for factor in (rows.vectors[product.x], rows.vectors[product.y]):
-                for part in factor:
-                    numbers += [part.body, float(part.direction), *part.place]
-                numbers += [-2.0, 0.0, 0.0, 0.0, 0.0] * (2 - len(factor))
-            table.append(numbers)
-        found["constraints.between"] = np.array(table)
+    products: list[float] = []
+    for product in rows.products:
+        products += [product.factor, product.constant]
+        for part in (*rows.vectors[product.x], *rows.vectors[product.y]):
+            products += [part.body, float(part.direction), *part.place]
+    if products:
+        found["constraints.between"] = np.array(products)
     if rows.ties:
-        ties = np.zeros((len(rows.ties), 2 + max(len(tie.coefficients) for tie in rows.ties)))
-        for row, tie in zip(ties, rows.ties, strict=True):
-            row[: 2 + len(tie.coefficients)] = tie.follower, tie.leader, *tie.coefficients
-        rates = np.array([[float(tie.rate)] for tie in rows.ties])
-        found["constraints.ties"] = np.hstack([ties, rates]) if (rates >= 0).any() else ties
+        most = max(len(tie.coefficients) for tie in rows.ties)
+        table = [
+            (t.follower, t.leader, *t.coefficients, *[0.0] * (most - len(t.coefficients)), t.rate) for t in rows.ties
+        ]
+        found["constraints.ties"] = np.array(table, dtype=np.float64)
     if rows.customs:
-        found["constraints.custom"] = np.array([[float(factor.rows)] for factor in rows.customs])
+        found["constraints.custom"] = np.array([float(factor.rows) for factor in rows.customs])
     return found
 
 
-_KEEPS = "motions and plans do, with varpin.Midpoint() or varpin.Gauss(stages)"
-
-
-def refuse_constraints(scene: Scene, what: object, instead: str = _KEEPS) -> None:
-    """Refuse a scene with constraints in ``what``; the message ends with the alternative ``instead``.
-
-    Raises:
-        InputError: The scene has constraints.
-    """
+def refuse_constraints(
+    scene: Scene, what: object, instead: str = "motions and plans do, with varpin.Midpoint() or varpin.Gauss(stages)"
+) -> None:
+    """Refuse a scene with constraints in ``what``; the message ends with the alternative ``instead``."""
     if scene.constraints:
-        names = ", ".join(dict.fromkeys(type(constraint).__name__ for constraint in scene.constraints))
+        names = scene.terms["constraints"]
         raise InputError(f"{what} does not take scenes with constraints, and this one has {names}: {instead}")
-
-
-def refuse_inputs(scene: Scene, what: str) -> None:
-    """Refuse a scene with kinematic inputs in ``what``.
-
-    Raises:
-        InputError: The scene has kinematic inputs.
-    """
-    if scene.inputs:
-        names = ", ".join(scene.robot.joint_names[c] for c in scene.inputs.values())
-        raise InputError(
-            f"{what} does not take scenes with a KinematicInput, and this one has them for {names}: simulate, "
-            "simulate_ensemble and OptimalControlProblem do"
-        )
 
 
 def closest_controls(scene: Scene, q: Floats) -> Floats:
@@ -756,12 +699,11 @@ def differences(scene: Scene, values: Mapping[str, Floats], *, noise: bool) -> l
         # A CustomNoise has no numbers.
         if same(before, now) or (name.startswith("noise.") and (lacks or not noise)):
             continue
-        what = _WORDS.get(name, name)
+        what = f"the robot's {name}" if name in _OF_TREE else name
         if lacks:
             what += f" (none in the {'motion' if now.size else 'scene'})"
         elif before.shape == now.shape:
-            off = np.abs(now - before)
-            at = np.unravel_index(int(off.argmax()), off.shape)
+            at = np.unravel_index(int(np.abs(now - before).argmax()), now.shape)
             joint = f" at joint {scene.robot.joint_names[at[0]]!r}" if name in _OF_JOINTS else ""
             what += f" ({before[at]:.6g} in the motion, {now[at]:.6g} in the scene{joint})"
         found.append(what)
@@ -789,50 +731,29 @@ def _gravity(gravity: ArrayLike | bool, robot: Robot) -> Floats:
     return finite_array("gravity", given, (3,))
 
 
-def _resistance(
-    name: str, given: JointValues | Literal["robot"] | None, own: Floats, robot: Robot, *, decided: bool
-) -> Floats:
-    """Damping or dry friction (n,) from the argument of a scene; the log says where the description's is left out."""
-    if isinstance(given, str) and given != "robot":
-        raise InputError(f"{name} must be numbers, or 'robot' for those of the robot's description, got {given!r}")
-    if isinstance(given, str) and not own.any():
+def _warn_of_description(robot: Robot, name: str, what: str, *, gives: bool, asked: bool, decided: bool) -> None:
+    """Log that the description gives nothing where it is asked for, or something that nobody decided about."""
+    if asked and not gives:
         logger.warning("robot %r: %s='robot' is none, because the description gives none", robot.name, name)
-    if given is None and own.any() and not decided:
-        message = "robot %r: the scene leaves out the %s of its description: %s='robot' takes it, %s=0 silences this"
-        logger.warning(message, robot.name, name, name, name)
-    return not_negative(name, own if isinstance(given, str) else 0.0 if given is None else given, robot)
+    if gives and not (asked or decided):
+        message = "robot %r: the scene leaves out the %s of its description: %s='robot' takes it, %s=%s silences this"
+        logger.warning(message, robot.name, what, name, name, 0 if name == what else "()")
 
 
 def given_constraints(
     robot: Robot, given: Constraint | Sequence[Constraint | Literal["robot"]] | Literal["robot"] | None
 ) -> tuple[Constraint, ...]:
-    """The constraints from the argument of a scene, with those of the robot's description in place of ``"robot"``.
-
-    Logs what the robot's description gives and the scene leaves out.
-    """
+    """The constraints from the argument of a scene, with those of the robot's description in place of ``"robot"``."""
     parts: Any = ("robot",) if is_one_of(given, ("robot",)) else () if given is None else given
-    words = sum(is_one_of(part, ("robot",)) for part in parts) if isinstance(parts, list | tuple) else 0
-    if not words:
-        found = constraints_of(parts)
-        undecided = given is None or (found and all(isinstance(part, KinematicInput) for part in found))
-        if undecided and robot.equalities:
-            named = [equality.name for equality in robot.equalities]
-            more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
-            logger.warning(
-                "robot %r: the scene leaves out what the description gives: equality constraints %s "
-                "(constraints='robot' takes them, constraints=() silences this message)",
-                robot.name,
-                ", ".join(named[:_NAMED]) + more,
-            )
-        return found
-    if words > 1:
-        raise InputError("constraints has the word 'robot' twice: it stands for all of the robot's description")
-    if not robot.equalities:
-        logger.warning("robot %r: constraints='robot' is none, because the description gives none", robot.name)
-    own = description_constraints(robot)
-    return constraints_of(
-        [each for part in parts for each in (own if is_one_of(part, ("robot",)) else (part,))],
-    )
+    if asked := isinstance(parts, list | tuple) and any(is_one_of(part, ("robot",)) for part in parts):
+        own = description_constraints(robot)
+        parts = [each for part in parts for each in (own if is_one_of(part, ("robot",)) else (part,))]
+    found = constraints_of(parts)
+    # Kinematic inputs alone are no decision on those of the description.
+    decided = given is not None and not (found and all(isinstance(part, KinematicInput) for part in found))
+    gives = bool(robot.equalities)
+    _warn_of_description(robot, "constraints", "equality constraints", gives=gives, asked=asked, decided=decided)
+    return found
 
 
 def _forces(
@@ -844,33 +765,41 @@ def _forces(
     rest: JointValues,
 ) -> dict[str, Any]:
     """The attributes of a scene that follow from its forces, by name."""
-    # Both are checked even if they are zero and make no element.
     given = forces_of(forces)
-    damped, rubs = (any(isinstance(each, kind) for each in given) for kind in (JointDamper, CoulombFriction))
-    viscous = _resistance("damping", damping, robot.damping, robot, decided=damped)
+    kinds = {type(force) for force in given}
+
+    def resistance(name: str, value: Any, own: Floats, *, decided: bool) -> Floats:
+        asked = isinstance(value, str)
+        if asked and value != "robot":
+            raise InputError(f"{name} must be numbers, or 'robot' for those of the robot's description, got {value!r}")
+        _warn_of_description(robot, name, name, gives=bool(own.any()), asked=asked, decided=decided)
+        values = own if asked else 0.0 if value is None else value
+        return not_negative(name, joint_array(name, values, robot.joint_names, uniform=True))
+
+    viscous = resistance("damping", damping, robot.damping, decided=damping is not None or JointDamper in kinds)
     # Numbers for the damping are a decision on the dry friction, too.
-    numbers = damping is not None and not isinstance(damping, str)
-    dry = _resistance("friction", friction, robot.friction, robot, decided=rubs or numbers)
-    stiff = not_negative("stiffness", stiffness, robot)
+    decided = friction is not None or not (damping is None or is_one_of(damping, ("robot",)))
+    dry = resistance("friction", friction, robot.friction, decided=decided or CoulombFriction in kinds)
+    stiff = not_negative("stiffness", joint_array("stiffness", stiffness, robot.joint_names, uniform=True))
     slack = joint_array("rest", rest, robot.joint_names, uniform=True)
-    if dry.any():
-        given = (CoulombFriction(dry), *given)
-    if viscous.any():
-        given = (JointDamper(viscous), *given)
-    if stiff.any():
-        given = (JointSpring(stiff, slack), *given)
-        if units := degrees_hint(robot, "rest", slack):
-            logger.warning(units)
+    positions = {"rest": slack if stiff.any() else np.zeros(robot.dof)}
+    given = (
+        *([JointSpring(stiff, slack)] if stiff.any() else []),
+        *([JointDamper(viscous)] if viscous.any() else []),
+        *([CoulombFriction(dry)] if dry.any() else []),
+        *given,
+    )
     bound = [each for force in given for each in bound_force(force, robot)]
     elements = [each for each in bound if isinstance(each, Element)]
     for side, name in enumerate(("lower", "upper")):
-        ends = np.zeros(robot.dof)
+        ends = positions[f"the {name} end of the JointStop"] = np.zeros(robot.dof)
         for element in of_kind(elements, "JointStop"):
-            ends[element.coordinate] = element.values[side] if np.isfinite(element.values[side]) else 0.0
-        if units := degrees_hint(robot, f"the {name} end of the JointStop", ends):
+            ends[element.coordinate] = np.nan_to_num(element.values[side], posinf=0.0, neginf=0.0)
+    for name, values in positions.items():
+        if units := degrees_hint(robot, name, values):
             logger.warning(units)
     own_code = tuple(force for force in given if isinstance(force, CustomForce))
-    total = {kind: np.zeros(robot.dof) for kind in ("JointDamper", "JointSpring", "Armature")}
+    total = {kind: np.zeros(robot.dof) for kind in _SUMMED}
     for element in elements:
         if element.kind in total:
             total[element.kind][element.coordinate] += element.values[0]
@@ -890,15 +819,13 @@ def _forces(
     }
 
 
-def _refuse_noisy_servos(noise: Noise | Sequence[Noise] | None, elements: Sequence[Element], robot: Robot) -> None:
+def _refuse_noisy_servos(models: Sequence[Noise], elements: Sequence[Element], robot: Robot) -> None:
     """Refuse noise in proportion to the controls of servos: these are positions, whose zero is arbitrary."""
-    given = noise if isinstance(noise, Sequence) else [noise]
-    models = [term for model in given for term in (model.terms if isinstance(model, NoiseSum) else [model])]
-    servos = [servo.coordinate for servo in of_kind(elements, "PositionServo")]
+    servos = of_kind(elements, "PositionServo")
     if servos and any(isinstance(model, ControlNoise) for model in models):
         raise InputError(
-            f"ControlNoise is proportional to forces, but the control of joint {robot.joint_names[servos[0]]!r} is "
-            "the position of its servo: take AdditiveNoise"
+            f"ControlNoise is proportional to forces, but the control of joint "
+            f"{robot.joint_names[servos[0].coordinate]!r} is the position of its servo: take AdditiveNoise"
         )
 
 
@@ -907,31 +834,26 @@ def _is_input(tie: Tied) -> bool:
     return tie.follower == tie.leader and not tie.coefficients
 
 
-def _own_control(robot: Robot, actuation: Floats, c: int, what: str) -> int:
-    """The control that drives coordinate ``c`` alone, with factor 1; an InputError if there is none."""
-    drives = np.flatnonzero(actuation[c])
-    if len(drives) == 1 and actuation[c, drives[0]] == 1.0 and np.count_nonzero(actuation[:, drives[0]]) == 1:
-        return int(drives[0])
-    raise InputError(
-        f"the {what} of joint {robot.joint_names[c]!r} needs a control of its own, and no column of the actuation "
-        "has a 1 at this joint and zeros elsewhere"
-    )
+def _driven(robot: Robot, actuation: Floats, servos: Sequence[Element], inputs: Sequence[int]) -> Floats:
+    """The actuation with the columns of servos multiplied by their stiffness.
 
-
-def _require_positions(robot: Robot, actuation: Floats, elements: Sequence[Element], bound: Bound) -> None:
-    """Refuse a KinematicInput whose joint has no control of its own, or also has a servo."""
-    served = {servo.coordinate for servo in of_kind(elements, "PositionServo")}
-    for tie in filter(_is_input, bound.rows.ties):
-        if tie.follower in served:
-            raise InputError(f"joint {robot.joint_names[tie.follower]!r} has both a PositionServo and a KinematicInput")
-        _own_control(robot, actuation, tie.follower, "KinematicInput")
-
-
-def _of_forces(actuation: Floats, bound: Bound) -> Floats:
-    """The actuation with zeros for the positions of kinematic inputs, which absorb all forces on their joints."""
-    forces = actuation.copy()
-    forces[[tie.follower for tie in filter(_is_input, bound.rows.ties)]] = 0.0
-    return forces
+    Raises:
+        InputError: A joint has two servos or kinematic inputs, or one without a control of its own with factor 1.
+    """
+    scaled, taken = actuation.copy(), set()
+    drives = [(servo.coordinate, servo.values[0], "PositionServo") for servo in servos]
+    for c, stiffness, what in [*drives, *((c, 1.0, "KinematicInput") for c in inputs)]:
+        joint, columns = robot.joint_names[c], np.flatnonzero(actuation[c])
+        if c in taken:
+            raise InputError(f"joint {joint!r} has more than one PositionServo or KinematicInput")
+        if not (len(columns) == 1 and np.array_equal(actuation[:, columns[0]], np.eye(robot.dof)[c])):
+            raise InputError(
+                f"the {what} of joint {joint!r} needs a control of its own, and no column of the actuation has a 1 at "
+                "this joint and zeros elsewhere"
+            )
+        taken.add(c)
+        scaled[c, columns] = stiffness
+    return scaled
 
 
 def _with_rates(actuation: Floats, bound: Bound) -> tuple[Floats, Bound]:
@@ -946,21 +868,6 @@ def _with_rates(actuation: Floats, bound: Bound) -> tuple[Floats, Bound]:
         np.hstack([actuation, np.zeros((len(actuation), len(cubic)))]),
         bound._replace(rows=bound.rows._replace(ties=tuple(ties))),
     )
-
-
-def _served(robot: Robot, actuation: Floats, elements: Sequence[Element]) -> Floats:
-    """The actuation with the columns of servos multiplied by their stiffness.
-
-    Raises:
-        InputError: A joint has two servos, or a servo's joint has no control of its own with factor 1.
-    """
-    servos, scaled = of_kind(elements, "PositionServo"), actuation.copy()
-    for servo in servos:
-        c = servo.coordinate
-        if sum(other.coordinate == c for other in servos) > 1:
-            raise InputError(f"joint {robot.joint_names[c]!r} has two position servos")
-        scaled[c, _own_control(robot, actuation, c, "position servo")] = servo.values[0]
-    return scaled
 
 
 def _actuation(robot: Robot, actuation: ArrayLike | Sequence[str] | None) -> Floats:

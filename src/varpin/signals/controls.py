@@ -11,9 +11,8 @@ from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import InputError
 from varpin.mechanics.scene import Scene
-from varpin.signals.commands import Times, changing, on_lines, open_line, open_loop
+from varpin.signals.commands import Times, changing, on_lines, open_line, open_loop, prescribing
 from varpin.signals.functions import Sampled
-from varpin.signals.inputs import prescribing
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.support.checks import JointValues, as_floats, control_array, require_finite
 
@@ -43,16 +42,13 @@ def commands_of(scene: Scene, integrator: Method, controls: Controls, steps: int
         ControlError: The function of an OpenLoop failed; the error holds no trajectory.
     """
     if isinstance(controls, LinearPolicy):
-        if controls.joints is not None and controls.joints != scene.control_joints:
-            raise InputError(
-                f"the policy's controls are of joints {', '.join(controls.joints)}; "
-                f"the scene's of {', '.join(scene.control_joints or ('no single joints',))}"
-            )
-        if controls.servos is not None and controls.servos != scene.servo_joints:
-            raise InputError(
-                f"the policy's controls are positions of {', '.join(controls.servos) or 'no joints'} and forces of all "
-                f"others; the scene has servos on {', '.join(scene.servo_joints) or 'no joints'}"
-            )
+        for what, own, of_scene in (
+            ("controls", controls.joints, scene.control_joints),
+            ("servos", controls.servos, scene.servo_joints),
+        ):
+            if own is not None and own != of_scene:
+                named = (", ".join(joints or ("no single joints",)) for joints in (own, of_scene))
+                raise InputError("the policy's {} are of {}, the scene's of {}".format(what, *named))
         return controls.commands(
             steps, scene.controls, scene.robot.dof, integrator.variational, dt, integrator.stage_times
         )

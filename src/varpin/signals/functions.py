@@ -1,34 +1,48 @@
-"""Controls that are functions: control laws, and functions of time, of which a step takes their own moments."""
+"""Controls that are functions: control laws, and functions of time, of which a step takes their own moments.
+
+The control within a step is the polynomial with the function's own moments: that of degree s - 1 for a method of s
+stages, so that the impulse and s - 1 moments more are right. What is left is orthogonal to all polynomials of lower
+degree, which keeps the order 2 s of Gauss's methods and 2 s - 1 of Radau's: a smooth motion integrates it to
+zero up to terms of higher order. A quadrature that is refined where it has not settled finds the moments.
+"""
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 
 from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands
 from varpin.errors import ControlError, InputError, UnknownJoint
 from varpin.finding import Finding
 from varpin.mechanics.scene import Scene
-from varpin.signals.commands import Times, changing, open_loop
-from varpin.signals.inputs import as_moved, prescribing
-from varpin.signals.moments import Moments, joined, moments_of, none_of
-from varpin.signals.policy import FirstOrderHold, OpenLoop
+from varpin.signals.commands import Times, changing, open_loop, prescribing
+from varpin.signals.policy import OpenLoop
 from varpin.support.checks import JointValues, control_values, finite_array, require_finite, takes
 
 ControlLaw = Callable[[float, Floats, Floats], JointValues]
-# Root mean square of what a step's polynomial leaves of a function of time, as a share of its largest value, up to
-# which the motion's own residual shows its error: a third order of it is lost.
-_RESOLVED = 0.02
-# The same share up to which more stages help: a jump has a quarter in a step of two stages, a fast wave more. And the
-# most parts of a step in which it is looked for.
-_FOLLOWED, _MOST_PARTS = 0.3, 64
-# Distance of a kinematic input from its control at the start [rad or m, rad/s or m/s] without a warning.
-_ELSEWHERE = 1e-6
+# Values (K, m) of a function at times (K,) [s] in steps (K,).
+Values = Callable[[Floats, Integers], Floats]
+
+# Number of moments: one for each stage of the method with the most.
+MOMENTS = 8
+# Length of a panel [s] and its points: none of them are more than 0.8 ms apart, so that no blow of a millisecond is
+# missed; those of steps of at most 2.5 ms, which are as near to each other. Halves of a panel have as many points, so
+# that they see what the panel has seen at its ends.
+_PANEL, _POINTS, _SHORT, _FEW = 0.01, 20, 2.5e-3, 8
+# A panel has settled where the last few coefficients of its Legendre series, times its share of the step, are below a
+# share of the largest value: jumps are then found to 1e-9 of a step. From 1e-7 to 1e-11 motions agree to that.
+_SETTLED = 1e-9
+# Distance of a panel's outermost values from its ends, as a share of its half: jumps at the ends are beyond them.
+_INSIDE = 1e-9
+# Halvings of a panel, and evaluations of a step on average, after which it counts as unsettled.
+_HALVINGS, _MOST = 40, 2000
 
 
 def require_law(law: ControlLaw) -> None:
@@ -51,6 +65,136 @@ def decision(law: ControlLaw, scene: Scene, step: int, time: float, q: Floats, v
     """
     read = _reader("controls(t, q, v)", scene)
     return _called("controls(t, q, v)", lambda: law(time, q.copy(), v.copy()), read, step, time)[None]
+
+
+@dataclass(frozen=True)
+class Moments:
+    """A function of time over N steps.
+
+    Attributes:
+        series: Coefficients (N, K, m) of its Legendre series over each step.
+        rest: Root mean square (N, s) of what is beyond the first s = 1 .. K terms, for the worst control.
+        extremes: The least and the largest value of each control seen in each step (2, N, m).
+        unsettled: Steps whose quadrature has not settled (U,).
+    """
+
+    series: Floats
+    rest: Floats
+    extremes: Floats
+    unsettled: Integers
+
+    @property
+    def largest(self) -> float:
+        """The largest absolute value seen."""
+        return float(np.abs(self.extremes).max(initial=0.0))
+
+    def at(self, times: Sequence[float]) -> Floats:
+        """The polynomials with the function's moments, at ``times`` (s,) of each step: (N, s, m)."""
+        values: Floats = legvander(2.0 * np.array(times) - 1.0, len(times) - 1) @ self.series[:, : len(times)]
+        return values
+
+    def part(self, first: int, last: int) -> Moments:
+        """Steps first .. last of them."""
+        taken = slice(first, last)
+        here = self.unsettled[(self.unsettled >= first) & (self.unsettled < last)]
+        return Moments(self.series[taken], self.rest[taken], self.extremes[:, taken], here)
+
+    @property
+    def mean(self) -> Floats:
+        """The means over the steps (N, m)."""
+        return self.series[:, 0]
+
+
+def moments_of(values: Values, first: int, count: int, dt: float, breaks: Sequence[float] = ()) -> Moments:
+    """The moments of a function over ``count`` steps of ``dt`` [s] from step ``first`` on.
+
+    Args:
+        values: The function.
+        first: The first step.
+        count: Their number.
+        dt: Length of a step [s].
+        breaks: Times at which the function jumps or has kinks [s].
+    """
+    step, begin, width = _panels(first, count, dt, np.array(breaks, dtype=np.float64))
+    total, square, spent = np.zeros((0, 0, 0)), np.zeros((0, 0)), 0
+    extremes = np.zeros((2, 0, 0))
+    unsettled = np.zeros(0, dtype=np.int64)
+    points = _POINTS if dt > _SHORT else _FEW
+    x, weights, to_series, to_ends = _rule(points)
+    for halving in range(_HALVINGS + 1):
+        inside = begin[:, None] + width[:, None] * x
+        found = values(((first + step)[:, None] + inside).ravel() * dt, np.repeat(first + step, len(x)))
+        found = found.reshape(len(step), len(x), -1)
+        spent += len(step) * len(x)
+        if not total.size:
+            total = np.zeros((count, MOMENTS, found.shape[2]))
+            square = np.zeros((count, found.shape[2]))
+            extremes = np.repeat([[[np.inf]], [[-np.inf]]], count, axis=1) + square
+        np.minimum.at(extremes[0], step, found.min(axis=1))
+        np.maximum.at(extremes[1], step, found.max(axis=1))
+        # The gaps between the outermost points and the ends have values of their own.
+        inside, ends, found = inside[:, 1:-1], found[:, [0, -1]], found[:, 1:-1]
+        tail = np.abs(np.einsum("kp,jpm->jkm", to_series[-(points // 3) :], found)).max(axis=(1, 2), initial=0.0)
+        beside = np.abs(np.einsum("ep,jpm->jem", to_ends, found) - ends).max(axis=(1, 2), initial=0.0)
+        tail = np.maximum(tail, x[1] * beside)
+        last = halving == _HALVINGS or spent > _MOST * count + _MOST * 50
+        open_ = tail * width > _SETTLED * np.abs(extremes).max(initial=0.0)
+        done = np.ones_like(open_) if last else ~open_
+        # Moments about the whole step, from the values at the points of its panels.
+        basis = legvander(2.0 * inside[done] - 1.0, MOMENTS - 1) * (width[done, None, None] * weights[:, None])
+        np.add.at(total, step[done], np.einsum("jpk,jpm->jkm", basis, found[done]))
+        np.add.at(square, step[done], np.einsum("j,p,jpm->jm", width[done], weights, found[done] ** 2))
+        if last:
+            unsettled = np.unique(first + step[open_])
+        if last or not open_.any():
+            break
+        step, half = np.repeat(step[open_], 2), np.repeat(0.5 * width[open_], 2)
+        begin = np.repeat(begin[open_], 2) + np.tile([0.0, 1.0], int(open_.sum())) * half
+        width = half
+    degrees = 2.0 * np.arange(MOMENTS) + 1.0
+    power = np.cumsum(degrees[:, None] * total**2, axis=1)
+    rest = np.sqrt(np.maximum(square[:, None] - power, 0.0)).max(axis=2, initial=0.0)
+    return Moments(degrees[:, None] * total, rest, extremes, unsettled)
+
+
+def none_of(controls: int) -> Moments:
+    """The moments over no steps."""
+    shape = 0, MOMENTS
+    return Moments(np.zeros((*shape, controls)), np.zeros(shape), np.zeros((2, 0, controls)), np.zeros(0, np.int64))
+
+
+def joined(parts: Sequence[Moments]) -> Moments:
+    """Consecutive steps as one."""
+    if len(parts) == 1:
+        return parts[0]
+    series, rest, unsettled = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("series", "rest", "unsettled")
+    )
+    return Moments(series, rest, np.concatenate([part.extremes for part in parts], axis=1), unsettled)
+
+
+def _panels(first: int, count: int, dt: float, breaks: Floats) -> tuple[Integers, Floats, Floats]:
+    """Panels of steps: the step of each from 0 on, its begin and its width in units of a step."""
+    number = max(1, int(np.ceil(dt / _PANEL)))
+    edges = (np.arange(count)[:, None] + np.arange(number) / number).ravel()
+    at = breaks / dt - first
+    edges = np.unique(np.concatenate([edges, at[(at > 0.0) & (at < count)]]))
+    step = edges.astype(np.int64)
+    return step, edges - step, np.diff(np.append(edges, float(count)))
+
+
+@functools.cache
+def _rule(points: int) -> tuple[Floats, Floats, Floats, Floats]:
+    """Gauss-Legendre points on a unit panel between its ends (p + 2,), their weights (p,), and two matrices.
+
+    The matrices lead to the Legendre series (p, p), and to its values at the ends (2, p).
+    """
+    x, w = np.polynomial.legendre.leggauss(points)
+    degrees = np.arange(points)
+    to_series = (0.5 * (2.0 * degrees + 1.0))[:, None] * (legvander(x, points - 1) * w[:, None]).T
+    ends = np.array([_INSIDE - 1.0, 1.0 - _INSIDE])
+    at = 0.5 * (1.0 + np.concatenate([ends[:1], x, ends[1:]]))
+    return at, 0.5 * w, to_series, legvander(ends, points - 1) @ to_series
 
 
 class Sampled(OpenLoop):
@@ -103,45 +247,28 @@ class Sampled(OpenLoop):
         return prescribing(self.scene, commands, ends)
 
 
-def function_findings(controls: Sampled, duration: float) -> tuple[Finding, ...]:
-    """Warnings: the quadrature of a function of time has not settled in some steps, or no break is in the motion."""
-    found: list[Finding] = []
-    if steps := controls.whole.unsettled.tolist():
-        text = (
-            f"the controls of OpenLoop change too fast in {len(steps)} steps for their impulse to be known "
-            f"(from t = {steps[0] * controls.dt:.3g} s). Name the instants of jumps, OpenLoop(f, breaks=[...])"
-        )
-        found.append(Finding("fast controls", text, time=steps[0] * controls.dt, value=float(len(steps)), unit="steps"))
-    if controls.breaks and not any(0.0 <= at <= duration for at in controls.breaks):
-        text = f"breaks of OpenLoop are from {controls.breaks[0]:.4g} s on, outside the motion: they are in [s]"
-        found.append(Finding("breaks outside", text, time=controls.breaks[0]))
-    return tuple(found)
+def function_findings(controls: Sampled) -> tuple[Finding, ...]:
+    """A warning if the quadrature of a function of time has not settled in some steps."""
+    steps = controls.whole.unsettled.tolist()
+    if not steps:
+        return ()
+    text = (
+        f"the controls of OpenLoop change too fast in {len(steps)} steps for their impulse to be known "
+        f"(from t = {steps[0] * controls.dt:.3g} s). Name the instants of jumps, OpenLoop(f, breaks=[...])"
+    )
+    return (Finding("fast controls", text, time=steps[0] * controls.dt, value=float(len(steps)), unit="steps"),)
 
 
-def resolved(controls: Sampled, times: Times) -> bool:
-    """Whether the polynomials of a method with stages at ``times`` are nearly the function itself in all steps."""
-    found = controls.whole
-    rest = found.rest[:, max(1, len(times)) - 1]
-    return bool(rest.max(initial=0.0) <= _RESOLVED * found.largest) and not len(found.unsettled)
+def left_by_stages(controls: Sampled, stages: int) -> float:
+    """What polynomials through so many stages leave of the function in the worst step, as a share of its largest value.
 
-
-def parts_to_follow(controls: Sampled, times: Times) -> int:
-    """The parts of a step in which polynomials of a method with stages at ``times`` follow the function; 1 where whole.
-
-    They are looked for in the step in which the function is fastest.
-
-    Raises:
-        ControlError: The function failed.
+    A root mean square; infinite where the quadrature of a step has not settled.
     """
-    order = max(1, len(times)) - 1
-    whole = controls.whole
-    worst, parts = int(whole.rest[:, order].argmax()), 1
-    here = whole.part(worst, worst + 1)
-    values = functools.partial(_values, controls, controls.scene)
-    while here.rest[:, order].max() > _FOLLOWED * whole.largest and parts < _MOST_PARTS:
-        parts *= 2
-        here = moments_of(values, worst * parts, parts, controls.dt / parts, controls.breaks)
-    return parts
+    found = controls.whole
+    rest = float(found.rest[:, max(1, stages) - 1].max(initial=0.0))
+    if len(found.unsettled):
+        return math.inf
+    return rest / found.largest if rest > 0.0 else 0.0
 
 
 def _values(controls: OpenLoop, scene: Scene, times: Floats, steps: Integers) -> Floats:
@@ -171,25 +298,6 @@ def _values(controls: OpenLoop, scene: Scene, times: Floats, steps: Integers) ->
             _called(name, alone, lambda value: finite_array(name, value, (1, m)), step, time)
         problem = f"{name} fails for {len(times)} times at once, and for none of them alone: {failure}"
         raise ControlError(*at[0], problem) from failure
-
-
-def begins_elsewhere(controls: OpenLoop | FirstOrderHold, scene: Scene, q0: Floats, v0: Floats) -> tuple[Finding, ...]:
-    """A warning if a kinematic input's control at the first node differs from the motion's start (q0, v0)."""
-    if not scene.inputs:
-        return ()
-    if isinstance(controls, OpenLoop):
-        first = _values(controls, scene, np.zeros(1), np.zeros(1, dtype=np.int64))[0]
-    else:
-        first = controls.u[0]
-    found = []
-    there = as_moved(scene, q0, v0, first)
-    for k in scene.prescribed[np.abs(there - first)[scene.prescribed] > _ELSEWHERE].tolist():
-        text = (
-            f"control {k}, of a KinematicInput, is {first[k]:.6g} at t = 0 and the motion begins with {there[k]:.6g}: "
-            "the joint jumps in the first step. Start there, or give another control"
-        )
-        found.append(Finding("jump at the start", text, time=0.0, value=float(there[k] - first[k])))
-    return tuple(found)
 
 
 def _reader(name: str, scene: Scene) -> Callable[[JointValues], Floats]:

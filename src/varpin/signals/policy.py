@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,11 +20,11 @@ from varpin.support.checks import (
     count,
     finite_array,
     flag,
-    is_one_of,
     named_limits,
     positive,
     require_finite,
     takes,
+    word,
 )
 from varpin.support.frozen import Frozen
 
@@ -179,14 +179,10 @@ class LinearPolicy(Frozen):
         if rows.shape == (steps + 1, size):
             rows = rows[:steps]
         names = None if joints is None else tuple(joints)
-        if on is not None and not is_one_of(on, ("momentum", "velocity")):
-            raise InputError(f"on must be 'momentum', 'velocity' or None, got {on!r}")
+        if on is not None:
+            word("on", on, ("momentum", "velocity"))
         if names is not None and len(names) != m:
             raise InputError(f"joints must name the joint of each of the {m} controls, got {names}")
-        if names is None and any(isinstance(given, Mapping) for given in (before, *(() if limits is None else limits))):
-            raise InputError(
-                "limits and before by joint name take the names of the controls, joints=scene.control_joints"
-            )
         if linear and before is None:
             raise InputError("controls that are linear between nodes need before, the control at the first node")
         if previous is not None and previous_gains is None:
@@ -289,15 +285,10 @@ class LinearPolicy(Frozen):
             )
         hold, intervals = self.hold if dt is None else self.hold_at(dt), len(self.gains)
         if intervals * hold != steps:
-            finer = ""
-            if self.period is None and intervals and steps % intervals == 0 and steps > intervals * hold:
-                finer = (
-                    f". If dt is finer than the policy's own, hold={steps // intervals} holds each control as long, "
-                    "or give LinearPolicy the period of its intervals, period= [s]"
-                )
+            own = "; a policy with period= [s] acts at any dt that divides it" if self.period is None else ""
             raise InputError(
-                f"the policy has {intervals} controls, each held over {hold} steps: "
-                f"for {intervals * hold} steps, not {steps}{finer}"
+                f"the policy has {intervals} controls, each held over {hold} steps: for {intervals * hold} steps, not "
+                f"{steps}{own}"
             )
         if self.gains.shape[1:] != (controls, 2 * dof):
             raise InputError(f"the policy's gains must have shape (N, {controls}, {2 * dof}), got {self.gains.shape}")

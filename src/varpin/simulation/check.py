@@ -27,10 +27,9 @@ from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
 from varpin.model import joint_unit
-from varpin.signals.commands import changing, cubics, in_parts, open_loop, rows, shares
+from varpin.signals.commands import changing, cubics, in_parts, in_parts_of_steps, open_loop, prescribing, rows, shares
 from varpin.signals.controls import Controls, commands_of
-from varpin.signals.functions import Sampled, parts_to_follow
-from varpin.signals.inputs import in_parts_of_steps, prescribing
+from varpin.signals.functions import Sampled, left_by_stages
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.gate import proven_error
 from varpin.simulation.law import Law, law_of
@@ -45,9 +44,11 @@ from varpin.trajectory import Trajectory
 TOLD, TOLD_VELOCITY = 0.01, 0.25
 # The share that a better step should leave.
 _AIM = 0.2
-# Most parts of a step that are named; the order of motions with kinks in forces; the excess of an error of half the
-# travel.
-_MOST_PARTS, _KINKED, _LOST = 10, 2, 0.5 / TOLD
+# Most parts of a step that are named; the order of motions with kinks in forces.
+_MOST_PARTS, _KINKED = 10, 2
+# What polynomials may leave of a function of time, as a share of its largest value, for the motion's own residual to
+# show its error: a third order of it is lost.
+_RESOLVED = 0.02
 # The rate of dampers and stops that a step resolves, in units of 1 / dt: with 1 to 3 the same advice is right.
 _RINGS = 2.0
 # Stages of the repetition beyond those of a motion of the same order.
@@ -65,7 +66,6 @@ def check(
     trajectory: Trajectory,
     controls: Controls | Commands = None,
     *,
-    resolved: bool = True,
     restart: int = 0,
     known: Floats | None = None,
     hold: int = 0,
@@ -78,14 +78,14 @@ def check(
         trajectory: The motion, without warnings.
         controls: What the controls were, where they are more than the motion has recorded: a function of time, lines
             between nodes, or linear feedback, which acts on the repetition too. Others are those of the record, held.
-        resolved: Whether the polynomials of the record are nearly the function of time that the controls are.
         restart: Steps after which the repetition begins anew at a node of the motion, where a controller has corrected
             the errors before it; 0 for none.
         known: The error, if it is known (N + 1, n): nothing is repeated.
         hold: The period of a control law in steps, 0 for none. Where a repetition under the recorded controls is far
             off, and the record tells the law, another one has its feedback.
     """
-    extremes = controls.whole.extremes if isinstance(controls, Sampled) else None
+    function = controls if isinstance(controls, Sampled) else None
+    extremes = None if function is None else function.whole.extremes
     limits = beyond_limits(scene, trajectory, extremes)
     if not trajectory.steps:
         known = np.zeros_like(trajectory.q)
@@ -97,6 +97,7 @@ def check(
         return trajectory.changed(warnings=(Finding("error", text), *limits))
     # A function of time would be called again for parts of a step, at whatever time the error is asked for.
     calls = isinstance(controls, OpenLoop) and closer(scene, integrator, trajectory, sampled=True)[1] > 1
+    resolved = function is None or left_by_stages(function, len(integrator.stage_times)) <= _RESOLVED
     proven = proven_error(scene, integrator, trajectory) if resolved and not (held_mean or calls) else None
     repeat = functools.partial(repeated, scene, integrator, trajectory, controls, restart)
     found: tuple[Finding, ...] = ()
@@ -371,29 +372,26 @@ def _cure(
         return "Damping or friction is faster than the step: use integrator=varpin.Radau(4)"
     if isinstance(integrator, Reference):
         return "Use a smaller rtol"
+    stages = (integrator.order + 1) // 2 + _MORE
+    if isinstance(controls, Sampled) and left_by_stages(controls, stages) > _RESOLVED:
+        return "The controls change faster than the step. Use a smaller dt"
     # Kinks of forces cost any method its order.
     order = integrator.order if scene.smooth else min(integrator.order, _KINKED)
     times = (max(excess, 1.0) / _AIM) ** (1.0 / order)
-    least = _MOST_PARTS if not times < _MOST_PARTS else max(2, math.ceil(times))
-    follow = parts_to_follow(controls, integrator.stage_times) if isinstance(controls, Sampled) else 1
-    parts, smaller = finer(trajectory, max(least, math.ceil(contact / most)) * follow)
+    parts = max(2.0, min(times, _MOST_PARTS), contact / most)
+    parts, smaller = finer(trajectory, math.ceil(parts))
     if hold:
         smaller += f" with period={hold * parts}"
     elif isinstance(controls, LinearPolicy) and controls.period is None:
         smaller += f" with hold={controls.hold * parts} in the policy"
-    if follow > 1:
-        return f"The controls change faster than the step. Use {smaller}"
     if contact > most:
         return f"Stops are stiffer than the step resolves. Use {smaller}"
-    stages = (integrator.order + 1) // 2 + _MORE
     fed = isinstance(controls, LinearPolicy) and not integrator.variational
     if fed or stages > MOST_STAGES or not (scene.smooth or not scene.elements):
         return f"Use {smaller}"
     other = f"integrator=varpin.{'Radau' if integrator.l_stable else 'Gauss'}({stages})"
-    # As large as the motion, errors tell no more how much it takes; and of a low order, smaller steps take too many.
-    if times < _MOST_PARTS:
-        return f"Use {other} or {smaller}"
-    return f"Use {other} and a smaller dt" if excess > _LOST else f"Use {other}"
+    # Of a low order smaller steps take too many, and errors as large as the motion tell no more how many.
+    return f"Use {other} or {smaller}" if times < _MOST_PARTS else f"Use {other}"
 
 
 def short_forces(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:

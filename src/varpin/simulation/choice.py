@@ -9,10 +9,9 @@ from typing import Literal
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.core import fastest_damping, pulls_fast
 from varpin.integrators import Gauss, Integrator, Midpoint, Radau
 from varpin.mechanics.scene import Scene
-from varpin.simulation.spectrum import stops_ahead
+from varpin.simulation.spectrum import fastest_damping, pulls_fast, stops_ahead
 
 # The default, and the default under noise, where more stages do not raise the strong order.
 _USUAL, _NOISY = Gauss(2), Midpoint(kick="held")
@@ -40,11 +39,11 @@ def usual_integrator(scene: Scene, q0: Floats, v0: Floats, dt: float, *, noisy: 
         v = np.zeros_like(q)
         # At rest servos that hold q0 do not saturate.
         forces = np.tile(scene.actuation @ scene.holding @ q0, (len(q), 1))
-        if pulls_fast(scene.core, q[1:], v[1:], forces[1:], dt / _TURNS):
+        if pulls_fast(scene, q[1:], forces[1:], dt / _TURNS):
             chosen = _SWINGING
         # Radau's methods do not keep constraints. Dry friction is steepest at rest.
         v[0] = v0
-        if scene.dissipates and not scene.constraints and fastest_damping(scene.core, q, v, forces, _RINGS / dt) > 0.0:
+        if scene.dissipates and not scene.constraints and fastest_damping(scene, q, v, forces, _RINGS / dt) > 0.0:
             chosen = _STOPPING
     # A motion without the noise of its scene may be linearized.
     return replace(chosen, kick=usual_kick(scene))

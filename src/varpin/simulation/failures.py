@@ -70,14 +70,16 @@ class StepFailure(VarpinError, RuntimeError):
         trajectory: The motion before, with a warning if its control loop is unstable.
     """
 
-    def __init__(self, step: int, time: float, failure: Failure, trajectory: Trajectory, cause: str = "") -> None:
+    def __init__(
+        self, step: int, time: float, failure: Failure, trajectory: Trajectory, advice: str = "Use a smaller dt"
+    ) -> None:
         self.step = step
         self.time = float(time)
         self.residual = failure.residual
         self.reason = failure.reason
         self.q, self.v, self.p = trajectory.q[-1], trajectory.v[-1], trajectory.p[-1]
         self.trajectory = trajectory
-        self.advice = cause or "Use a smaller dt"
+        self.advice = advice
         self.problem = f"step {step} (t = {time:.6g} s) failed: {failure.reason}"
         super().__init__(f"{self.problem}. {self.advice}. The motion so far is in error.trajectory")
 

@@ -18,7 +18,7 @@ from varpin.integrators import Integrator, Reference
 from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import Scene
 from varpin.signals.commands import Times, interpolation
-from varpin.simulation.spectrum import speed_scales, travel_scales
+from varpin.simulation.spectrum import fastest_damping, speed_scales, travel_scales
 from varpin.trajectory import Trajectory
 
 # Largest propagated errors of q and v of a motion that is let pass, as shares of the travel and of the largest speed: a
@@ -51,7 +51,8 @@ def proven_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
         return None
     times = integrator.stage_times if trajectory.u_stages.shape[1] else ()
     narrow, wide = _stretches(times, integrator.order <= _SHORT_STEPS)
-    off = propagated_errors(
+    propagate = functools.partial(
+        propagated_errors,
         scene.core,
         trajectory.q,
         trajectory.v,
@@ -60,14 +61,23 @@ def proven_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
         trajectory.dt,
         narrow=narrow,
         wide=wide,
-        # Between the nodes at which dampers are looked at, dry friction may be any damper.
-        damping=0.0 if of_kind(scene.elements, "CoulombFriction") else _RATE,
-        damped_at=_DAMPERS,
         most_q=_TRAVEL * travel_scales(scene, trajectory.q),
         most_v=_SPEED * speed_scales(scene, trajectory.v),
     )
-    largest = float(off.max(initial=0.0))
+    damped = bool(scene.elements)
+    largest = float(propagate(damped=damped).max(initial=0.0))
+    if damped and not math.isfinite(largest) and not _damped(scene, trajectory):
+        largest = float(propagate(damped=False).max(initial=0.0))
     return _SURE * largest if math.isfinite(largest) else None
+
+
+def _damped(scene: Scene, trajectory: Trajectory) -> bool:
+    """Whether a damper may be faster than the step; between the nodes, dry friction may be any damper."""
+    if of_kind(scene.elements, "CoulombFriction"):
+        return True
+    at = np.linspace(0, trajectory.steps, _DAMPERS).astype(np.int64)
+    forces = trajectory.u[np.minimum(at, trajectory.steps - 1)] @ scene.actuation.T
+    return fastest_damping(scene, trajectory.q[at], trajectory.v[at], forces, _RATE / trajectory.dt) > 0.0
 
 
 def _turns_over(scene: Scene, trajectory: Trajectory) -> bool:

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from varpin.arrays import Floats
-from varpin.core import inside_bounds
+from varpin.arrays import Floats, Mask
 from varpin.finding import Finding, and_more
 from varpin.mechanics.forces import drive_forces, limited_servos, of_kind
 from varpin.mechanics.scene import Scene
@@ -32,14 +31,12 @@ def beyond_limits(scene: Scene, trajectory: Trajectory, extremes: Floats | None 
         cure = "constraints='robot'" if scene.robot.equalities else f"constraints=[varpin.PointOnPoint({a!r}, {b!r})]"
         text = f"the robot's loop of {a!r} on {b!r} is open{and_more(len(loops) - 1, 'loop')}: the motion is a tree's. "
         found.append(Finding("open loops", f"{text}Use varpin.Scene(robot, {cure})"))
-    if not any(scene.bounded):
+    bounded: Mask = np.asarray(np.isfinite(scene.bounds).any(axis=(1, 2)))
+    if not bounded.any():
         return found
-    q, v, u = trajectory.q, trajectory.v, trajectory.u
-    inside = inside_bounds(scene.core, q, v, u, trajectory.u_stages, scene.bound_rows)
-    kept = (inside[0], inside[1], inside[2] and scene.direct_efforts and extremes is None)
-    bounds = scene.bounds.position, scene.bounds.velocity, scene.bounds.effort
-    for kind, (least, most) in enumerate(bounds):
-        if kept[kind] or not scene.bounded[kind]:
+    q, v = trajectory.q, trajectory.v
+    for kind, (least, most) in enumerate(scene.bounds):
+        if not bounded[kind]:
             continue
         values = (q, v, _efforts(scene, trajectory, extremes) if kind == 2 else v)[kind]
         with np.errstate(invalid="ignore"):

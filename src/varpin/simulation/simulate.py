@@ -19,16 +19,14 @@ from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.signals.commands import open_loop, steps_of
 from varpin.signals.controls import Controls, commands_of
-from varpin.signals.functions import ControlLaw, Sampled, begins_elsewhere, function_findings, require_law, resolved
+from varpin.signals.functions import ControlLaw, Sampled, function_findings, require_law
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.check import check as checked
 from varpin.simulation.choice import usual_integrator
 from varpin.simulation.failures import Interrupted, NoiseError, StepFailure, named
-from varpin.simulation.loop import outgrown, unstable_loop
-from varpin.simulation.progress import Progress, Reporter
-from varpin.simulation.record import MotionRecord, function_error, next_block
+from varpin.simulation.loop import unstable_loop
+from varpin.simulation.record import MotionRecord, Progress, Reporter, function_error, next_block
 from varpin.simulation.start import (
-    controls_in_degrees,
     duration_for_tolerance,
     in_other_units,
     on_constraints,
@@ -136,10 +134,10 @@ def simulate(
     accuracy: Accuracy | None = None
     error: Floats | None = None
     unmet: tuple[Finding, ...] = ()
-    early = in_other_units(scene, q0)
+    given = q0
+    moved: tuple[Finding, ...] = ()
     if scene.constraints:
         q0, v0, moved = on_constraints(scene, q0, v0)
-        early = (*early, *moved)
     if tolerance is not None:
         span = duration_for_tolerance(dt, steps, duration)
         chosen = steps_for_tolerance(scene, q0, v0, span, tolerance, controls, integrator)
@@ -189,24 +187,17 @@ def simulate(
     try:
         found: list[Finding] = [*unmet, *noise_forgotten(scene, rng, increments)]
         if check:
-            function = controls if isinstance(controls, Sampled) else None
-            whole = function is None or resolved(function, integrator.stage_times)
-            given = None if callable(controls) or interrupted else controls
-            motion = checked(scene, integrator, motion, given, resolved=whole, known=known, hold=period if law else 0)
+            ended = interrupted and not isinstance(controls, Sampled)
+            more = None if callable(controls) or ended else controls
+            motion = checked(scene, integrator, motion, more, known=known, hold=period if law else 0)
             loop = () if hold is None else unstable_loop(scene, motion, hold)
             wrong = [finding for finding in motion.warnings if finding.kind == "error"]
-            of_function = function_findings(function, motion.duration) if function else ()
-            found = [*loop, *wrong, *of_function, *found, *motion.warnings]
-            if isinstance(controls, OpenLoop | FirstOrderHold):
-                found += begins_elsewhere(controls, scene, q0, v0)
+            unsettled = function_findings(controls) if isinstance(controls, Sampled) else ()
+            found = [*loop, *wrong, *unsettled, *found, *motion.warnings]
         elif known is not None:
             motion = motion.with_error(known)
-        found += early
-        if not any(finding.kind == "start in degrees" for finding in early):
-            # Without controls servos hold the start.
-            found += controls_in_degrees(scene, motion.u)
-        # Values in wrong units explain all else.
-        found.sort(key=lambda told: not told.kind.endswith(("degrees", "millimetres")))
+        # Values in wrong units explain all else. Without controls servos hold the start.
+        found = [*in_other_units(scene, given, motion.u), *found, *moved]
         motion = motion.changed(warnings=ranked(found), accuracy=accuracy)
     except KeyboardInterrupt:
         raise Interrupted(motion.changed(accuracy=accuracy)) from None
@@ -248,9 +239,7 @@ def _roll(
             segment = _rolled_out(record, state, block)
             record.add(segment, block.within)
             if segment.failure is not None:
-                # The last decision of a law is in no step of the record yet.
-                decided = (done, block.u) if callable(controls) else None
-                raise _step_failure(record, segment.failure, hold if check else None, decided)
+                raise _step_failure(record, segment.failure, hold if check else None)
             reporter.add(segment, record.steps, due=done // chunk < record.steps // chunk)
     except KeyboardInterrupt:
         return False
@@ -275,25 +264,16 @@ def _rolled_out(record: MotionRecord, state: object, block: Commands) -> Segment
     return segment
 
 
-def _step_failure(
-    record: MotionRecord, failure: Failure, hold: int | None, decided: tuple[int, Floats] | None
-) -> StepFailure:
+def _step_failure(record: MotionRecord, failure: Failure, hold: int | None) -> StepFailure:
     """The error of a step that failed, its motion with a warning where an unstable control loop is the cause.
 
-    Args:
-        record: The motion so far.
-        failure: Of the step.
-        hold: Steps between two decisions of the control loop; None to leave the loop unchecked.
-        decided: Of a law the step of its last decision, and that decision (1, m).
+    ``hold`` is the period of the loop in steps, None to leave it unchecked.
     """
-    node, cause = record.trajectory(), ""
-    if hold is not None:
-        last, u = (node.steps, node.u[:0]) if decided is None else decided
-        loop = unstable_loop(record.scene, node, hold)
-        found = loop or outgrown(np.concatenate([node.u[:last:hold], u]), hold * record.dt)
-        if found:
-            node, cause = node.changed(warnings=found), found[0]
-    return StepFailure(node.steps, node.t[-1], named(record.scene, failure), node, cause)
+    motion = record.trajectory()
+    found = () if hold is None else unstable_loop(record.scene, motion, hold)
+    motion = motion.changed(warnings=found)
+    advice = found[0] if found else "Use a smaller dt" if hold is None else "Use a smaller dt, or lower gains"
+    return StepFailure(motion.steps, motion.t[-1], named(record.scene, failure), motion, advice)
 
 
 def noise_forgotten(

@@ -7,12 +7,12 @@ order in it, but for their curvature lam . g_qq.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from varpin.arrays import Floats, Integers
-from varpin.core import fastest_damping
 from varpin.errors import LinearizationError
 from varpin.integrators.explicit import accelerations
 from varpin.mechanics.forces import dissipates, limited_servos, of_kind
@@ -123,18 +123,50 @@ def masses(scene: Scene, q: Floats) -> Floats:
     return scene.core.jets(q, np.zeros_like(q))[0]
 
 
-def damping_matrices(scene: Scene, q: Floats, v: Floats, forces: Floats) -> Floats:
-    """D (K, n, n) of M w' = -D w, of what acts at joints and between links, without custom forces.
+def damping_matrices(scene: Scene, q: Floats, v: Floats, forces: Floats, *, custom: bool = False) -> Floats:
+    """D (K, n, n) of M w' = -D w, of what acts at joints and between links; of custom forces on request.
 
     At states q, v (K, n) under constant forces (K, n); symmetric.
     """
     q, v = np.ascontiguousarray(q), np.ascontiguousarray(v)
     dampers = -np.minimum(scene.core.forces(q, v, np.ascontiguousarray(forces))[2], 0.0)
     D: Floats = dampers[:, :, None] * np.eye(q.shape[1])
-    if scene.couplings:
+    if scene.couplings or (custom and scene.custom is not None):
         slopes = scene.core.coupled_forces(q, v)[2]
         D -= 0.5 * (slopes + np.swapaxes(slopes, 1, 2))
     return D
+
+
+def _definite(matrices: Floats) -> bool:
+    """Whether all of some symmetric matrices (K, n, n) are positive definite."""
+    try:
+        np.linalg.cholesky(matrices)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def fastest_damping(scene: Scene, q: Floats, v: Floats, forces: Floats, least: float) -> float:
+    """The largest rate of damping [1/s] at states q, v (K, n) under constant forces (K, n); 0 if below ``least``."""
+    M, D = masses(scene, q), damping_matrices(scene, q, v, forces, custom=True)
+    if _definite(least * M - D):
+        return 0.0
+    if not _definite(M):
+        return math.inf
+    root = np.linalg.cholesky(M)
+    white = np.linalg.solve(root, np.swapaxes(np.linalg.solve(root, D), 1, 2))
+    return float(np.linalg.eigvalsh(white).max())
+
+
+def pulls_fast(scene: Scene, q: Floats, forces: Floats, dt: float) -> bool:
+    """Whether springs, servos or gravity advance a mode by more than a radian in ``dt`` [s], at rest at q (K, n)."""
+    q, still = np.ascontiguousarray(q), np.zeros_like(q)
+    K = np.array([scene.core.jet(x, still[0])[3] for x in q])
+    K += scene.core.forces(q, still, np.ascontiguousarray(forces))[1][:, :, None] * np.eye(q.shape[1])
+    if scene.couplings:
+        slopes = scene.core.coupled_forces(q, still)[1]
+        K += 0.5 * (slopes + np.swapaxes(slopes, 1, 2))
+    return not _definite(masses(scene, q) + dt**2 * np.array([K, -K]))
 
 
 def rate_at_rest(scene: Scene, q: Floats) -> float:
@@ -147,7 +179,7 @@ def rate_at_rest(scene: Scene, q: Floats) -> float:
     still, force = np.zeros((1, q.size)), np.zeros((1, q.size))
     for servo in limited_servos(scene.elements):
         force[0, servo.coordinate] = servo.values[0] * q[servo.coordinate]
-    return float(fastest_damping(scene.core, np.ascontiguousarray(q[None]), still, force, _SLOWEST))
+    return fastest_damping(scene, q[None], still, force, _SLOWEST)
 
 
 def fastest_rate(scene: Scene, q: Floats, v: Floats, u: Floats, least: float) -> float:
@@ -176,8 +208,7 @@ def fastest_rate(scene: Scene, q: Floats, v: Floats, u: Floats, least: float) ->
         states.append((q[node], still, node))
     states += _in_stops(scene, q, v)
     q, v, at = (np.concatenate(rows) for rows in zip(*states, strict=True))
-    forces = np.ascontiguousarray(u[np.minimum(at, len(u) - 1)] @ scene.actuation.T)
-    return float(fastest_damping(scene.core, q, v, forces, least))
+    return fastest_damping(scene, q, v, u[np.minimum(at, len(u) - 1)] @ scene.actuation.T, least)
 
 
 def contact_rate(scene: Scene, q: Floats, v: Floats, dt: float) -> float:

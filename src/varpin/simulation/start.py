@@ -10,8 +10,8 @@ from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.finding import Finding
 from varpin.mechanics.assembly import along_constraints, dependent_input, missed, nearest
-from varpin.mechanics.scene import CORRECTED, EARTH, Scene
-from varpin.model import degrees_hint, joint_unit, millimetres_hint
+from varpin.mechanics.scene import CORRECTED, Scene
+from varpin.model import degrees_hint, joint_unit
 from varpin.support.checks import count, positive
 from varpin.trajectory import Trajectory
 
@@ -19,55 +19,18 @@ from varpin.trajectory import Trajectory
 _ROUNDING = 1e-9
 # Distance of a duration from a multiple of the step, as a share: rounding.
 _MULTIPLE = 1e-9
-# Gravity within this share of a thousand times the Earth's looks like mm/s^2.
-_EARTHLY = 0.01
-_PULL = math.hypot(*EARTH)
-# First number of a spring's rest among its values, after both points and the stiffness.
-_SPRINGS = {"FrameSpring": 9, "FrameLengthSpring": 7}
 
 
-def in_other_units(scene: Scene, q0: Floats) -> tuple[Finding, ...]:
-    """Warnings of an initial state (n,) that looks like degrees, and of millimetres in gravity and springs."""
-    told = {
-        "start in degrees": degrees_hint(scene.robot, "q0", q0),
-        "gravity in millimetres": _gravity_hint(scene),
-        "springs in millimetres": _springs_hint(scene),
-    }
-    return tuple(Finding(kind, sentence) for kind, sentence in told.items() if sentence)
-
-
-def controls_in_degrees(scene: Scene, controls: Floats) -> tuple[Finding, ...]:
-    """A warning of positions in controls (N, m), of servos and prescribed joints, that look like degrees."""
-    if not (scene.holding.any() and len(controls)):
+def in_other_units(scene: Scene, q0: Floats, controls: Floats | None = None) -> tuple[Finding, ...]:
+    """A warning of an initial state (n,) that looks like degrees, else of such positions in controls (N, m)."""
+    if sentence := degrees_hint(scene.robot, "q0", q0):
+        return (Finding("start in degrees", sentence),)
+    if controls is None or not len(controls) or not scene.holding.any():
         return ()
     positions = controls @ scene.holding
     most = positions[np.abs(positions).argmax(axis=0), np.arange(positions.shape[1])]
     sentence = degrees_hint(scene.robot, "the position in controls", most)
     return (Finding("controls in degrees", sentence),) if sentence else ()
-
-
-def _gravity_hint(scene: Scene) -> str:
-    """A sentence about gravity that looks like mm/s^2."""
-    pull = math.hypot(*scene.gravity.tolist())
-    if not abs(pull / 1000.0 - _PULL) < _EARTHLY * _PULL:
-        return ""
-    return f"gravity is {pull:g} m/s^2, a thousand times the Earth's: it may be in mm/s^2, and gravity is in m/s^2"
-
-
-def _springs_hint(scene: Scene) -> str:
-    """A sentence about a spring between frames whose ends, or whose length at rest, look like millimetres."""
-    if not scene.couplings:
-        return ""
-    springs = [own for own in scene.couplings if own.kind in _SPRINGS]
-    lengths = {}
-    for number, spring in enumerate(springs, 1):
-        name = "FrameSpring" if len(springs) == 1 else f"FrameSpring {number}"
-        values = np.array(spring.values)
-        lengths[f"{name}: rest"] = float(np.linalg.norm(values[_SPRINGS[spring.kind] :]))
-        for end, body, place in (("a", spring.a, values[:3]), ("b", spring.b, values[3:6])):
-            root = scene.robot.tree.translation[0] if body < 0 else 0.0
-            lengths[f"{name}: the distance of its point {end}"] = float(np.linalg.norm(place - root))
-    return millimetres_hint(scene.robot, lengths) if lengths else ""
 
 
 def on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Floats, tuple[Finding, ...]]:

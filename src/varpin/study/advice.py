@@ -1,6 +1,6 @@
 """Advice: the cheapest integrator and step that meet an accuracy, or the most accurate within a time.
 
-Costs are wall times. Errors and steps are found as for a tolerance, see :mod:`varpin.simulation.ladder`.
+Costs are wall times. Errors and steps are found as for a tolerance, see :mod:`varpin.simulation.tolerance`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import ClassVar
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Reference
 from varpin.mechanics.scene import Scene
-from varpin.simulation.ladder import Ladder, Trial, first_steps
+from varpin.simulation.tolerance import Ladder, Trial, first_steps
 from varpin.study.motion import Setting, integrators_of
 from varpin.study.record import Chart, Study
 from varpin.support.checks import JointValues, positive

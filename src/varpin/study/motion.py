@@ -16,13 +16,13 @@ from varpin.errors import InputError
 from varpin.finding import announce
 from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene, require_scene
+from varpin.signals.commands import held_in_parts
 from varpin.signals.controls import control_rows
-from varpin.signals.inputs import held_in_parts
 from varpin.simulation.check import distance, repeated
 from varpin.simulation.failures import StepFailure
-from varpin.simulation.ladder import ROUNDING, Trial, candidates
 from varpin.simulation.simulate import simulate
 from varpin.simulation.start import on_constraints
+from varpin.simulation.tolerance import ROUNDING, Trial, candidates
 from varpin.support.checks import JointValues, joint_array, positive
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory

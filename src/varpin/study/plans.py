@@ -11,7 +11,6 @@ from typing import Any, ClassVar
 from varpin.control import OptimalControlProblem, Solution, solve
 from varpin.errors import InputError
 from varpin.integrators import Integrator
-from varpin.mechanics.scene import refuse_inputs
 from varpin.study.motion import fastest, integrators_of
 from varpin.study.record import Chart, Progress, Study, collect, pareto_front
 from varpin.support.checks import count, positive
@@ -130,7 +129,6 @@ def optimal_control_tradeoff(
     """
     if not isinstance(problem, OptimalControlProblem):
         raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
-    refuse_inputs(problem.scene, "optimal_control_tradeoff")
     members, repeats = integrators_of(problem.scene, integrators), count("repeats", repeats, least=1)
     steps = (2.0 * problem.dt, problem.dt, 0.5 * problem.dt) if dts is None else tuple(dts)
     jobs = [_discretized(problem, member, dt, period) for member in members for dt in sorted(steps, reverse=True)]

@@ -14,7 +14,7 @@ from varpin.errors import InputError, VarpinError
 from varpin.integrators import Gauss, Integrator, Reference
 from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
 from varpin.simulation.check import repeated
-from varpin.simulation.ladder import ROUNDING, SENSIBLE, Ladder, Trial, first_steps
+from varpin.simulation.tolerance import ROUNDING, SENSIBLE, Ladder, Trial, first_steps
 from varpin.study.motion import Setting, integrators_of
 from varpin.study.record import Chart, Progress, Study, collect, pareto_front
 from varpin.support.checks import JointValues, count, positive

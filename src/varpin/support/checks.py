@@ -75,8 +75,8 @@ def tuple_of(name: str, given: Any, kind: type, note: str = "") -> tuple[Any, ..
     return tuple(found)
 
 
-def broadcast_array(name: str, value: object, size: int) -> Floats:
-    """``value``, one number or (size,), as a new float array (size,).
+def broadcast_array(name: str, value: object, size: int, *, limit: bool = False) -> Floats:
+    """``value``, one number or (size,), as a new float array (size,); a ``limit`` need not be finite.
 
     Raises:
         InputError: As for :func:`finite_array`.
@@ -84,21 +84,31 @@ def broadcast_array(name: str, value: object, size: int) -> Floats:
     array = as_floats(name, value)
     if array.shape not in ((), (size,)):
         raise InputError(f"{name} must be one number or have shape ({size},), got {array.shape}")
-    return np.array(np.broadcast_to(require_finite(name, array), (size,)))
+    return np.array(np.broadcast_to(array if limit else require_finite(name, array), (size,)))
 
 
 # Arguments that are positions of joints, for which the name of a posture may be given by mistake.
 _POSITIONS = frozenset({"q", "q0", "q1", "rest"})
 
 
-def joint_array(name: str, value: JointValues, joints: Sequence[str], *, uniform: bool = False) -> Floats:
+def joint_array(
+    name: str,
+    value: JointValues,
+    joints: Sequence[str],
+    *,
+    uniform: bool = False,
+    absent: float = 0.0,
+    lack: str = "the robot has no joint",
+) -> Floats:
     """``value`` as a new float array (n,) with a number for each of the n ``joints``.
 
     Args:
         name: Name of the argument, for the error.
-        value: (n,), or numbers by joint name; joints that are not named get 0.
+        value: (n,), or numbers by joint name.
         joints: The names, in order.
         uniform: Whether one number may be given for all joints.
+        absent: The number of joints that are not named. An infinite one stands for no limit, and may be given.
+        lack: What the message says of an unknown name.
 
     Raises:
         UnknownJoint: There is no joint of that name.
@@ -109,23 +119,21 @@ def joint_array(name: str, value: JointValues, joints: Sequence[str], *, uniform
             f"{name} must be real numbers, ({len(joints)},) or by joint name, got {value!r}; the positions of a "
             f"posture are robot.posture({value!r})"
         )
+    limit = not math.isfinite(absent)
     if not isinstance(value, Mapping):
-        return broadcast_array(name, value, len(joints)) if uniform else finite_array(name, value, (len(joints),))
-    array = np.zeros(len(joints))
+        if uniform:
+            return broadcast_array(name, value, len(joints), limit=limit)
+        return finite_array(name, value, (len(joints),))
+    array = np.full(len(joints), absent)
     for joint, number in value.items():
         if joint not in joints:
-            raise UnknownJoint(str(joint), joints, name)
-        array[joints.index(joint)] = finite(f"{name}[{joint!r}]", number)
+            raise UnknownJoint(str(joint), joints, name, lack)
+        array[joints.index(joint)] = (real if limit else finite)(f"{name}[{joint!r}]", number)
     return array
 
 
 def control_array(
-    name: str,
-    value: Mapping[str, float],
-    joints: Sequence[str] | None,
-    *,
-    absent: float = 0.0,
-    read: Callable[[str, Any], float] | None = None,
+    name: str, value: Mapping[str, float], joints: Sequence[str] | None, *, absent: float = 0.0
 ) -> Floats:
     """``value``, by the names of the driven joints, as a new float array (m,) with a number for each control.
 
@@ -133,24 +141,18 @@ def control_array(
         name: Name of the argument, for the error.
         value: Numbers by joint name.
         joints: The joint of each control; None where a control is not the force of one joint.
-        absent: The number for joints that are not named.
-        read: Converts an entry to a float or raises; :func:`finite` if left out.
+        absent: As in :func:`joint_array`.
 
     Raises:
         UnknownJoint: There is no driven joint of that name.
-        InputError: Controls have no names, or ``read`` refuses an entry.
+        InputError: Controls have no names, or a number is not finite.
     """
     if joints is None:
         raise InputError(
             f"{name} is given by joint name, but not every control is the force of one joint under this actuation: "
             "give numbers in the order of the controls"
         )
-    array = np.full(len(joints), absent)
-    for joint, number in value.items():
-        if joint not in joints:
-            raise UnknownJoint(str(joint), joints, name, "no control is the force of a joint")
-        array[joints.index(joint)] = (read or finite)(f"{name}[{joint!r}]", number)
-    return array
+    return joint_array(name, value, joints, absent=absent, lack="no control is the force of a joint")
 
 
 def control_values(
@@ -198,9 +200,7 @@ def named_limits(
     sides: Any = limits
     if isinstance(limits, tuple | list) and len(limits) == 2:
         sides = tuple(
-            control_array(f"{name}: {side}", value, joints, absent=none, read=real)
-            if isinstance(value, Mapping)
-            else value
+            control_array(f"{name}: {side}", value, joints, absent=none) if isinstance(value, Mapping) else value
             for side, value, none in zip(("lower", "upper"), limits, (-np.inf, np.inf), strict=True)
         )
     return checked_limits(name, sides, size)

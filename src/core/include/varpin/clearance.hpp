@@ -14,10 +14,8 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
-#include <optional>
 #include <vector>
 
-#include "varpin/checks.hpp"
 #include "varpin/dense.hpp"
 #include "varpin/dynamics.hpp"
 #include "varpin/policy.hpp"
@@ -40,23 +38,29 @@ struct Stretch {
     int node(int j) const { return j * (points - 1) / steps; }
 };
 
+// N steps and their nodes, row-major.
+struct Record {
+    std::int64_t steps = 0;
+    const double* q = nullptr;  // (N + 1, n)
+    const double* v = nullptr;  // (N + 1, n)
+    const double* u = nullptr;  // (N, m)
+    double h = 0.0;             // [s]
+};
+
 class Clearance {
   public:
-    // `wide` is a stretch of two steps, or null. `damping` are rates of dampers along single steps, in units of 1 / h,
-    // at `damped_at` nodes; above them the errors are not known.
+    // `wide` is a stretch of two steps, or null. With fast dampers, `damped`, errors are not known along single steps.
     Clearance(const Mechanism& mechanism, const Record& record, const double* within, const Stretch& narrow,
-              const Stretch* wide, double damping, std::int64_t damped_at)
+              const Stretch* wide, bool damped)
         : mechanism_(mechanism),
           record_(record),
           within_(within),
           narrow_(narrow),
           wide_(wide),
-          damping_(damping),
-          damped_at_(damped_at),
+          damped_(damped),
           n_(mechanism.dof()),
           dynamics_(mechanism, false),
           slopes_(mechanism, true),
-          inertias_(mechanism),
           before_(n_),
           last_(n_),
           q_(n_),
@@ -92,38 +96,15 @@ class Clearance {
     const double* within_;  // (N, s, m) controls at the stages; null for controls that are constant over each step
     const Stretch& narrow_;
     const Stretch* wide_;
-    double damping_;
-    std::int64_t damped_at_;
+    bool damped_;
     int n_;
     ForwardDynamics dynamics_, slopes_;
-    Inertias inertias_;
     std::vector<double> force_, a_;        // (points, n) of a stretch: of the controls, and accelerations
     std::vector<double> before_, last_;    // the same at the end of the stretch before
     std::vector<double> step_q_, step_v_;  // defects of the steps of a stretch (steps, n)
     std::int64_t from_ = 0, until_ = 0;    // its nodes
     std::vector<double> q_, v_, rate_, error_q_, error_v_;
     std::vector<double> aq_, av_, af_, lu_;
-    std::optional<bool> damped_;
-
-    // Whether a damper may be faster than the step.
-    bool damped() {
-        if (!damped_) damped_ = outpaced();
-        return *damped_;
-    }
-
-    bool outpaced() {
-        if (!mechanism_.forces.any()) return false;
-        std::vector<double> force(n_);
-        const std::int64_t last = damped_at_ - 1;
-        for (std::int64_t i = 0; i <= last; ++i) {
-            const std::int64_t node = i * record_.steps / last;
-            force_at(std::min(node, record_.steps - 1), force.data());
-            inertias_.masses_at(record_.q + node * n_);
-            inertias_.forces_at(record_.q + node * n_, record_.v + node * n_, force.data());
-            if (!inertias_.outpaces_dampers(damping_ / record_.h)) return true;
-        }
-        return false;
-    }
 
     // The error e of the motion from its defects l: e -> Phi e + l, with the flow Phi of the motion linearized in the
     // middle of each few steps, by the implicit midpoint rule.
@@ -186,7 +167,7 @@ class Clearance {
         if (pair && k + 1 < record_.steps && alike(k)) return examine(*wide_, k);
         if (pair && k > 0 && alike(k - 1)) return examine(*wide_, k - 1);
         // Along one step, methods of few stages fulfil the equations however wrong a fast damper's velocity is.
-        return !damped() && examine(narrow_, k);
+        return !damped_ && examine(narrow_, k);
     }
 
     // Whether the controls of steps k and k + 1 do not jump between them.

@@ -1,11 +1,9 @@
 // Costs weight . r^2 at samples (q, v, u), with their gradients and Gauss-Newton Hessians 2 J' weight J in
-// z = (q, v, u); and costs of changes of controls. docs/mathematics.md, "Costs in the task", "Smooth controls".
-// Equations (O5), (O7) and (O8) of docs/mathematics.md.
+// z = (q, v, u). docs/mathematics.md, "Costs in the task"; equations (O7) and (O8).
 #pragma once
 
 #include <algorithm>
 #include <cstddef>
-#include <utility>
 #include <vector>
 
 #include "varpin/kinematics.hpp"
@@ -319,58 +317,5 @@ class CostSample {
         }
     }
 };
-
-// The cost weight . (u_k - u_(k-1))^2 of each change of controls, (O5).
-class ChangeCost {
-  public:
-    // `before` (m) is the control before the first one, or empty if the first change has no cost.
-    ChangeCost(int controls, std::vector<double> weight, std::vector<double> before)
-        : controls_(controls),
-          weight_(std::move(weight)),
-          before_(std::move(before)),
-          change_(controls_),
-          weighted_(controls_) {}
-
-    // The cost of the change to control k of u (N, m).
-    double value(const double* u, std::size_t k) {
-        const double* from = k > 0 ? u + (k - 1) * controls_ : before_.empty() ? u : before_.data();
-        for (int i = 0; i < controls_; ++i) change_[i] = u[k * controls_ + i] - from[i];
-        return quadratic(weight_.data(), change_.data(), controls_, weighted_.data());
-    }
-
-    // Gradient (m) and Hessian (m, m) in u_k at fixed u_(k-1).
-    void expand(const double* u, std::size_t k, double* gradient, double* hessian) {
-        value(u, k);
-        for (int i = 0; i < controls_; ++i) gradient[i] = 2.0 * weighted_[i];
-        const double factor = k == 0 && before_.empty() ? 0.0 : 2.0;
-        for (std::size_t i = 0; i < weight_.size(); ++i) hessian[i] = factor * weight_[i];
-    }
-
-  private:
-    int controls_;
-    std::vector<double> weight_;  // (m, m)
-    std::vector<double> before_, change_, weighted_;
-};
-
-// The samples q and v (N s, n) of the steps of a motion, from its nodes (N + 1, n). A row of the rule (s, 9) holds a
-// weight, the coefficients of q0, v0, q1, v1 for q, and those for v.
-inline void sample_steps(const double* rule, std::size_t samples, std::size_t steps, std::size_t n, const double* q,
-                         const double* v, double* at_q, double* at_v) {
-    for (std::size_t k = 0; k < steps; ++k) {
-        const double* nodes[4] = {q + k * n, v + k * n, q + (k + 1) * n, v + (k + 1) * n};
-        for (std::size_t s = 0; s < samples; ++s) {
-            const double* row = rule + 9 * s;
-            for (const auto& [to, weights] : {std::pair{at_q, row + 1}, {at_v, row + 5}}) {
-                double* __restrict found = to + (k * samples + s) * n;
-                std::fill(found, found + n, 0.0);
-                for (int part = 0; part < 4; ++part) {
-                    // A node without weight may be NaN.
-                    if (weights[part] == 0.0) continue;
-                    for (std::size_t c = 0; c < n; ++c) found[c] += weights[part] * nodes[part][c];
-                }
-            }
-        }
-    }
-}
 
 }  // namespace varpin

@@ -51,40 +51,34 @@ struct LinearizedPlan {
     const double* slack = nullptr;        // (R, 2, m) lower and upper limit of the change of each control, or null
 };
 
-// The linearized motion under a plan, each control clipped to its limits, from `state` (2n + m): the deviation of
-// the state and of the previous control at the start, overwritten by those at the end. Writes the deviations before
-// each decision into `expected` (R, 2n + m), the changes of the controls into `moves` (R, m), and unless it is null
-// the states after each step into `after` (N, 2n). True where a control reaches a limit.
-inline bool predict(const LinearizedPlan& plan, double* state, double* expected, double* moves,
-                    double* after = nullptr) {
-    const int x = plan.states, m = plan.controls, size = x + m, hold = plan.hold;
-    std::vector<double> next(x);
+// The changes of the controls, each clipped to its limits, into `moves` (R, m), and the deviations of the state after
+// each step into `after` (N, 2n), of the linearized motion from the nominal state. True where a control reaches a limit.
+inline bool predict(const LinearizedPlan& plan, double* moves, double* after) {
+    const int x = plan.states, m = plan.controls;
+    const std::vector<double> start(x);
+    const double* state = start.data();
     bool limited = false;
     for (std::ptrdiff_t s = 0; s < plan.steps; ++s) {
-        const std::ptrdiff_t r = s / hold;
-        if (s % hold == 0) {
-            std::copy_n(state, size, expected + r * size);
-            for (int i = 0; i < m; ++i) {
-                double move = plan.feedforward[r * m + i];
-                const double* row = plan.feedback + (r * m + i) * x;
-                for (int c = 0; c < x; ++c) move += row[c] * state[c];
-                if (plan.slack) {
-                    const double* slack = plan.slack + r * 2 * m;
-                    limited = limited || move <= slack[i] || move >= slack[m + i];
-                    move = std::min(std::max(move, slack[i]), slack[m + i]);
-                }
-                moves[r * m + i] = state[x + i] = move;
-            }
+        const std::ptrdiff_t r = s / plan.hold;
+        double* move = moves + r * m;
+        for (int i = 0; i < m && s % plan.hold == 0; ++i) {
+            const double* row = plan.feedback + (r * m + i) * x;
+            move[i] = plan.feedforward[r * m + i];
+            for (int c = 0; c < x; ++c) move[i] += row[c] * state[c];
+            if (!plan.slack) continue;
+            const double *least = plan.slack + r * 2 * m, *most = least + m;
+            limited = limited || move[i] <= least[i] || move[i] >= most[i];
+            move[i] = std::min(std::max(move[i], least[i]), most[i]);
         }
         const double *A = plan.A + s * x * x, *B = plan.B + s * x * m;
+        double* next = after + s * x;
         for (int i = 0; i < x; ++i) {
             double total = 0.0;
             for (int c = 0; c < x; ++c) total += A[i * x + c] * state[c];
-            for (int c = 0; c < m; ++c) total += B[i * m + c] * state[x + c];
+            for (int c = 0; c < m; ++c) total += B[i * m + c] * move[c];
             next[i] = total;
         }
-        std::copy_n(next.data(), x, state);
-        if (after) std::copy_n(state, x, after + s * x);
+        state = next;
     }
     return limited;
 }

@@ -175,7 +175,7 @@ class WithinControlRate(PlanConstraint):
         """See :meth:`PlanConstraint.bind`."""
         name, m, joints = "WithinControlRate", horizon.controls, horizon.control_joints
         if isinstance(self.limit, Mapping):
-            limit = control_array(f"{name} limit", self.limit, joints, absent=np.inf, read=real)
+            limit = control_array(f"{name} limit", self.limit, joints, absent=np.inf)
         else:
             limit = np.asarray(self.limit)
             if limit.shape not in ((), (m,)):

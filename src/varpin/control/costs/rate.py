@@ -10,9 +10,8 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.control.costs.base import BoundCost, Cost, CostSum, Points
 from varpin.control.costs.least_squares import LeastSquares, checked_weight, plain, weight_matrix
-from varpin.core import change_values, expand_changes
 from varpin.errors import InputError
-from varpin.support.checks import JointValues, as_floats, control_array, control_values, require_finite
+from varpin.support.checks import JointValues, as_floats, control_array, control_values
 from varpin.support.frozen import Frozen
 
 
@@ -37,11 +36,12 @@ class ControlRateCost(LeastSquares):
                 the first control is free.
 
         Raises:
-            InputError: A weight that is not finite, indefinite, or neither number, vector nor square matrix; or a
-                control that is neither number nor vector, or not finite.
+            InputError: A weight that is not finite, indefinite, or neither number, vector nor square matrix.
         """
         self.weight = weight if isinstance(weight, Mapping) else checked_weight("ControlRateCost", weight)
-        self.before = before if before is None or isinstance(before, Mapping) else _number_or_vector(before)
+        self.before = (
+            before if before is None or isinstance(before, Mapping) else as_floats("ControlRateCost before", before)
+        )
 
     def _text(self) -> str:
         own = super()._text()
@@ -70,8 +70,9 @@ class ControlRate(Frozen):
 
     def shares(self, u: Floats, period: float) -> Floats:
         """Costs (..., N) of the changes to each of N controls (..., N, m) that change every ``period`` [s]."""
-        rows = np.ascontiguousarray(u).reshape(-1, *u.shape[-2:])
-        return change_values(self.weight / period, self._before, rows).reshape(u.shape[:-1])
+        changes = self._changes(u)
+        shares: Floats = ((changes @ (self.weight / period)) * changes).sum(axis=-1)
+        return shares
 
     def value(self, u: Floats, period: float) -> Floats:
         """The cost (...) of controls (..., N, m) that change every ``period`` [s]."""
@@ -80,20 +81,16 @@ class ControlRate(Frozen):
 
     def expand(self, u: Floats, period: float) -> tuple[Floats, Floats]:
         """Gradients (N, m) and Hessians (N, m, m) in u_k of the cost of each change, at controls (N, m)."""
-        return expand_changes(self.weight / period, self._before, np.ascontiguousarray(u))
+        hessian = np.tile(2.0 * self.weight / period, (len(u), 1, 1))
+        if self.before is None:
+            hessian[:1] = 0.0
+        return 2.0 * self._changes(u) @ (self.weight / period), hessian
 
-    @property
-    def _before(self) -> Floats:
-        """(1, m), or (0, m) where the first control is free."""
-        return np.zeros((0, len(self.weight))) if self.before is None else self.before[None]
-
-
-def _number_or_vector(before: JointValues) -> Floats:
-    start = require_finite("ControlRateCost before", as_floats("ControlRateCost before", before))
-    if start.ndim > 1:
-        raise InputError(f"ControlRateCost before must be one number or a vector, got shape {start.shape}")
-    start.setflags(write=False)
-    return start
+    def _changes(self, u: Floats) -> Floats:
+        """The change to each control (..., N, m); none to a first one that is free."""
+        first = u[..., :1, :]
+        changes: Floats = np.diff(u, axis=-2, prepend=first if self.before is None else first * 0.0 + self.before)
+        return changes
 
 
 def control_rate(cost: Cost, controls: int, joints: Sequence[str] | None = None) -> ControlRate | None:

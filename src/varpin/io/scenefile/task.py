@@ -402,7 +402,7 @@ def _on_robot(root: Where, tables: Mapping[str, Any], robot: Robot, dt: float, s
     try:
         scene = Scene(robot, **given)
     except VarpinError as error:
-        words = {"stiffness": "springs.stiffness", "Noise": "noise", "control": "actuation", "servo": "force"}
+        words = {"stiffness": "springs.stiffness", "Noise": "noise", "control": "actuation", "Servo": "force"}
         key = next((key for word, key in words.items() if word in str(error)), root.of(error, given).key)
         raise SceneFileError(root.path.name, key, str(error)) from None
     task = Task(
