@@ -333,7 +333,6 @@ controls = { "joint_0.0" = 0.1, "joint_12.0" = 0.3, "joint_5.0" = %s }
     [
         (('joints = ["elbow_joint", ', "joints = ["), "actuation"),
         (("torque_limit", "gear = 2.0\ntorque_limit"), "actuation"),
-        (("elbow_joint = 0.8, wrist_1_joint = 0.2, w", "elbow_joint = 45, w"), "simulate.controls"),
         (("wrist_2_joint = 1.0", "wrist_2_joint = 9.0"), "simulate.controls"),
         (("[initial]", '[[noise]]\ntype = "control"\nintensity = 0.1\n[initial]'), "noise"),
         (

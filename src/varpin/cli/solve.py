@@ -96,10 +96,9 @@ def _status(solution: Solution, scene: str, kept: Path | None) -> str:
 
 def _plan_table(file: SceneFile, solution: Solution, told: str, wall_time: float, files: Iterable[Path]) -> Table:
     problem, refinement = solution.problem, solution.refinement
-    apart = f", planned in {len(file.required.parts)} parts" if len(file.required.parts) > 1 else ""
     noise = f", and {solution.noise_cost:.6g} by noise" if solution.noise_cost else ""
     rows = [
-        ("joints", f"{file.robot.dof} of {file.required.described} computed{apart}"),
+        ("joints", f"{file.robot.dof} of {file.required.described} computed"),
         ("horizon", f"{problem.steps} steps of {problem.dt:g} s, {problem.integrator}"),
         ("status", told),
         ("cost", f"{solution.cost:.6g}{noise}, after {solution.iterations} iterations"),

@@ -86,7 +86,7 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
     # First the motion, whose masses give a clearer message for another robot.
     motion = replace(Trajectory.of_members(source, members, scene.robot), scene_values=scene.values)
     known = [name for name in members if name.startswith(("problem.", "scene."))]
-    if difference := problem.differs({name.removeprefix("problem."): members[name] for name in known}):
+    if difference := problem.differs({name.removeprefix("problem."): np.asarray(members[name]) for name in known}):
         raise FileError(f"{source} is of another problem: {difference}")
     sizes = {"decisions": problem.decisions, "controls": scene.controls, "states": 2 * scene.robot.dof}
     plan = record_of(_Plan, members, source, sizes=sizes)
