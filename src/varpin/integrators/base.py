@@ -382,9 +382,9 @@ def diffusion_and_drift(
 def noise_of_step(
     scene: Scene, F: Floats, q: Floats, v: Floats, ends: tuple[Floats, Floats], start: Floats, dw: Floats
 ) -> Floats:
-    """The impulse (n,) of increments dw (K,) at a state, by fields in Python, F (n, k) of the mean control.
+    """The impulse (n,) of increments dw (K,) at a state, by fields in Python: F (n, k) of the mean.
 
-    ``ends`` (1, m) are the controls at both ends of the step, ``start`` (n,) is the configuration at the motion's start.
+    ``ends`` (1, m) are the controls at both ends of the step, ``start`` (n,) is where the motion started.
     """
     k = scene.processes
     impulse: Floats = F @ dw[:k]

@@ -215,15 +215,9 @@ def contact_rate(scene: Scene, q: Floats, v: Floats, dt: float) -> float:
 
 
 def _in_stops(scene: Scene, q: Floats, v: Floats) -> list[tuple[Floats, Floats, Integers]]:
-    """States (1, n), (1, n) and nodes (1,) of a motion where joints are deepest in each stop, at full stiffness."""
-    states = []
-    for c, end, side, width in _ends(scene):
-        deepest = int((side * q[:, c]).argmax())
-        if (depth := side * (q[deepest, c] - end)) > 0.0:
-            pressed = q[deepest][None].copy()
-            pressed[0, c] = end + side * max(depth, width)
-            states.append((pressed, v[deepest][None], np.array([deepest])))
-    return states
+    """States (1, n), (1, n) and nodes (1,) of a motion where joints are deepest in each stop."""
+    deepest = [(c, end, side, int((side * q[:, c]).argmax())) for c, end, side, _ in _ends(scene)]
+    return [(q[[k]], v[[k]], np.array([k])) for c, end, side, k in deepest if side * (q[k, c] - end) > 0.0]
 
 
 def _ends(scene: Scene) -> list[tuple[int, float, float, float]]:
