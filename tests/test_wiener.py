@@ -247,38 +247,31 @@ def test_no_correction_where_fields_do_not_depend_on_the_velocity(part):
     assert motions[0].p.tobytes() == motions[1].p.tobytes()
 
 
-PATHS = 64
+PATHS, HOT = 64, 2.0
 
 
-class Bath:
-    """A hanging rod of 1 m and 1 kg at temperature ``heat`` [J], damped by ``friction`` [1/s] times its inertia."""
+def mean_energy(friction, kick, dt, duration):
+    """The mean of p v / kT of a hanging rod of 1 m and 1 kg in a bath, over time and paths, and its standard error.
 
-    def __init__(self, friction):
-        rng, self.heat, inertia = np.random.default_rng(4), 2.0, 1.0 / 3.0
-        strength = np.sqrt(2.0 * friction * inertia * self.heat)
-        self.scene = vp.Scene(vp.planar_chain(1), damping=friction * inertia, noise=vp.AdditiveNoise(strength))
-        # Starts from the canonical law, by rejection, so that nothing has to burn in.
-        q = rng.uniform(-np.pi, np.pi, (4000, 1))
-        weight = np.exp(0.5 * 9.81 * np.sin(q[:, 0]) / self.heat)
-        self.q = q[rng.uniform(size=4000) < weight / weight.max()][:PATHS]
-        self.v = rng.normal(scale=np.sqrt(self.heat / inertia), size=self.q.shape)
-
-    def estimate(self, averages):
-        """Mean and standard error of p'M^-1 p / (n kT) over the paths' averages of p'M^-1 p."""
-        averages = averages / (self.heat * self.q.shape[1])
-        return averages.mean(), averages.std(ddof=1) / np.sqrt(PATHS)
-
-    def simulated(self, kick, dt, duration):
-        """In pieces, whose paths fit into memory."""
-        rng, q, v, averages = np.random.default_rng(1), self.q, self.v, 0.0
-        for _ in range(20):
-            piece = vp.simulate_ensemble(
-                self.scene, q, v, dt=dt, steps=round(duration / 20 / dt), paths=PATHS, rng=rng,
-                integrator=vp.Midpoint(kick=kick),
-            )  # fmt: skip
-            q, v = piece.q[:, -1], piece.v[:, -1]
-            averages = averages + (piece.p[:, 1:] * piece.v[:, 1:]).sum(axis=2).mean(axis=1) / 20
-        return self.estimate(averages)
+    It is damped by ``friction`` [1/s] times its inertia.
+    """
+    rng, inertia = np.random.default_rng(4), np.array([1.0 / 3.0])
+    q = rng.uniform(-np.pi, np.pi, (4000, 1))
+    weight = np.exp(0.5 * 9.81 * np.sin(q[:, 0]) / HOT)
+    # Starts from the canonical law, by rejection, so that nothing has to burn in.
+    q = q[rng.uniform(size=4000) < weight / weight.max()][:PATHS]
+    v = rng.normal(scale=np.sqrt(HOT / inertia), size=q.shape)
+    damping = friction * inertia
+    scene = vp.Scene(vp.planar_chain(1), damping=damping, noise=vp.AdditiveNoise(np.sqrt(2.0 * damping * HOT)))
+    rng, energy, steps = np.random.default_rng(1), 0.0, round(duration / 20 / dt)
+    # In pieces, whose paths fit into memory.
+    for _ in range(20):
+        piece = vp.simulate_ensemble(
+            scene, q, v, dt=dt, steps=steps, paths=PATHS, rng=rng, integrator=vp.Midpoint(kick=kick)
+        )
+        q, v = piece.q[:, -1], piece.v[:, -1]
+        energy = energy + (piece.p[:, 1:] * piece.v[:, 1:]).sum(axis=2).mean(axis=1) / HOT / 20
+    return energy.mean(), energy.std(ddof=1) / np.sqrt(PATHS)
 
 
 # The left kick leaves nodes cold by dt * damping / inertia, so its limit shows at weak friction.
@@ -286,6 +279,6 @@ class Bath:
 @pytest.mark.parametrize(("dt", "duration"), [pytest.param(5e-3, 200.0, marks=pytest.mark.slow), (2e-2, 400.0)])
 def test_langevin_equipartition(kick, friction, dt, duration):
     """The time average of p'M^-1 p is n kT within 4 standard errors."""
-    mean, error = Bath(friction).simulated(kick, dt, duration)
+    mean, error = mean_energy(friction, kick, dt, duration)
     assert error < 0.05
     assert abs(mean - 1.0) < 4.0 * error

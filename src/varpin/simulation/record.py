@@ -162,8 +162,8 @@ def trajectory_of(
 ) -> Trajectory:
     """The motion from a first node through consecutive segments, with increments ``dw`` (N, k), None for zeros.
 
-    ``within`` are the controls at the stages (N, s, m), None for constant ones, ``on`` the commands of the whole
-    motion where its controls are linear between nodes.
+    ``within`` are the controls at the stages (N, s, m), None for constant ones; ``on`` the commands of the whole
+    motion, where its controls are linear between nodes.
     """
     steps = join(parts) if len(parts) > 1 else parts[0] if parts else first.part(0)
     N = len(steps.u)
