@@ -10,8 +10,6 @@ MARKS = {
     "noise not drawn": "no noise was applied",
     "open loops": "is open",
     "start off the constraints": "q0 was moved",
-    "restless ticks": "goes up and down",
-    "restless velocities": "goes up and down",
     "replay": "in quarters of dt",
     "noise within steps": "noise costs",
     "tolerance not met": "is not met",

@@ -14,7 +14,7 @@ import varpin as vp
 from varpin import replay
 from varpin.model.clearance import clearance
 from varpin.model.kinematics import frame_kinematics
-from varpin.show.replay.surroundings import regions
+from varpin.show.replay.annotations import regions
 
 ARM = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05), "joint2": ([0, 0, 0], [1, 0, 0], 0.05)}
 CUBE = np.array(list(product([-0.5, 0.5], repeat=3)))

@@ -82,6 +82,8 @@ def test_ticks_that_find_no_plan_are_told_of():
     far = vp.Mpc(tracking([vp.ReachFrame(ROBOT, "tip", position=[2.2, 0.0, 0.0])])).run(duration=0.3)
     assert far.infeasible.sum() > 3
     assert naming(far.warnings, "no plan", "ReachFrame('tip')")
+    # One iteration leaves a little of a violation that has a plan.
+    assert not vp.Mpc(tracking(FAMILIES["speeds"]), iterations=1).run(duration=0.6).infeasible.any()
     assert not unnamed(str(far), "ReachFrame('tip')")
     assert np.isfinite(far.plans[-1].multipliers.values).all()
 
@@ -129,13 +131,9 @@ def within_speeds(controls):
     )  # fmt: skip
 
 
-def chain(controls, constraints=None, **options):
+def chain(controls):
     """Two links without limits of torques."""
-    cost = vp.TrackingCost(lambda t: [0.8 * np.sin(1.5 * t), 0.4], 100.0) + vp.ControlCost(1e-4)
-    cost += vp.VelocityCost(1e-2)
-    constraints = [vp.WithinVelocityLimits(ROBOT, (-0.8, 0.8))] if constraints is None else constraints
-    given = {"dt": 0.03, "steps": 16, "controls": controls, "constraints": constraints} | options
-    return vp.OptimalControlProblem(vp.Scene(ROBOT, damping=0.3), cost, [0.0, 0.4], [0.0, 0.0], **given)
+    return tracking(FAMILIES["speeds"], controls=controls)
 
 
 @pytest.mark.parametrize("iterations", [1, pytest.param(2, marks=pytest.mark.slow)])
@@ -189,3 +187,13 @@ def test_ticks_within_speeds_are_close_to_their_optimum():
     costs = [np.mean([plan.cost for plan in run.plans]) for run in (one, three)]
     assert costs[0] <= 1.05 * costs[1]
     assert one.constraints[0].violation <= 3e-3
+
+
+def test_between_nodes_ticks_keep_to_the_middles_of_long_steps():
+    """Held controls, whose plans keep to the sphere at the nodes alone without it."""
+    sphere, found = vp.KeepOutOfSphere(ROBOT, "tip", [1.6, 0.0, -1.2], 0.25), {}
+    for between in (False, True):
+        problem = tracking([sphere], between_nodes=between).at(dt=0.06, steps=8)
+        found[between] = vp.Mpc(problem).run(duration=1.2).constraints[0].violation
+    assert found[False] > 1e-3
+    assert found[True] < 1e-4

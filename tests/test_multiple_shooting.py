@@ -83,21 +83,6 @@ def test_the_first_motion_follows_the_path():
     np.testing.assert_allclose(given.trajectory.q, path, atol=2e-3)
 
 
-@pytest.mark.parametrize("kind", ["limits", "rate", "true cost"])
-def test_what_goes_with_it(kind):
-    problem = reach(*([vp.ControlRateCost(1e-3)] if kind == "rate" else []))
-    if kind == "limits":
-        problem = reach(control_limits=(-30.0, 30.0))
-    options = {"true_cost": 0.01} if kind == "true cost" else {}
-    found = vp.solve(problem, states=line([1.0, 0.5]), check=False, **options)
-    assert found.status.converged
-    # As cheap as what a search of its own makes of it; searches for a true cost end at a hundredth of the wish.
-    within = 1e-4 if kind == "true cost" else 1e-5
-    assert vp.solve(found.problem, found, check=False).cost == pytest.approx(found.cost, rel=within)
-    if kind == "limits":
-        assert np.abs(found.controls).max() <= 30.0
-
-
 def test_around_an_obstacle():
     """A path above the ball leads to a plan above it; the way below costs more than five times as much."""
     arm = {name: ([0, 0, 0], [1, 0, 0], 0.05) for name in ("joint1", "joint2")}

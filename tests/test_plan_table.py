@@ -402,17 +402,6 @@ def test_a_controller_within_limits_and_constraints(controls: str) -> None:
     assert (run.iterations[1:] <= 2).all()
 
 
-def test_a_controllers_rates() -> None:
-    """Controls change by no more than the limit from tick to tick, beginning with the one before the run."""
-    problem = swing(vp.WithinControlRate(100.0, before=[14.0, 4.0]))
-    run = vp.Mpc(problem).run(duration=0.6)
-    substeps = run.motion.steps // len(run.plans)
-    applied = np.vstack([[14.0, 4.0], run.motion.u[::substeps]])
-    # The feedback acts within a tick about the plan made at its beginning: its first control is the plan's.
-    assert np.abs(np.diff(applied, axis=0)).max() <= 100.0 * 0.03 + 1e-4
-    assert not run.failed.any()
-
-
 def test_torques_of_a_loop_with_a_limit_of_the_rate_do_not_jump():
     """From tick to tick the lines join, and the plant's torque changes no faster than allowed, noise or not."""
     scene = vp.Scene(TWO, damping=0.1)

@@ -9,7 +9,7 @@ from findings import about
 from refusals import naming, unnamed
 
 import varpin as vp
-from varpin.control.checks import findings, restlessness
+from varpin.control.checks import findings
 from varpin.io.scenefile import scenes
 
 ARMS = {
@@ -41,13 +41,6 @@ def reach(robot, seed, *, damping=0.1, dt=0.01, steps=100, running="velocity", *
     return vp.OptimalControlProblem(scene, cost, begin, rest, dt=dt, steps=steps, **options)
 
 
-def changes(motion, smallest=1e-3):
-    """Changes of sign of the velocity's differences, of those that a thousandth of the joint's speed shows (n,)."""
-    d = np.diff(motion.v, axis=0)
-    seen = np.abs(d) > smallest * np.abs(motion.v).max(axis=0)
-    return ((d[1:] * d[:-1] < 0.0) & seen[1:] & seen[:-1]).sum(axis=0)
-
-
 def test_defaults():
     problem = reach(vp.planar_chain(2), 0, steps=2)
     assert problem.integrator == vp.Gauss(stages=3)
@@ -63,54 +56,25 @@ def test_defaults():
 
 
 def test_a_reach_of_a_heavy_arm_under_defaults(load):
-    """Its wrist is light, and cheap controls make it jump: by the midpoint rule it alternated in 99 of 99 steps."""
+    """Its wrist is light, and cheap controls make it jump."""
     plan = vp.solve(reach(load("ur10"), 1001))
     truth = plan.verify(tolerance=1e-6)
     assert plan.warnings == ()
     assert abs(truth.open_loop_loss) < 1e-3
-    assert changes(plan.trajectory).max() <= 12
 
 
-def test_the_midpoint_rule_tells_that_it_chatters(load, caplog):
+def test_samples_at_midpoints_alone_are_told_of(load, caplog):
+    """Optimal velocities alternate between them; the log tells it once for a scene and a step."""
     problem = reach(load("ur10"), 1001, integrator=vp.Midpoint(), sampling="midpoint")
     with caplog.at_level(logging.WARNING):
         plans = [vp.solve(problem) for _ in range(2)]
-    assert changes(plans[0].trajectory).max() > 90
-    (told,) = about(plans[0].warnings, "restless velocities")
+    (told,) = about(plans[0].warnings, "replay")
     assert not unnamed(told, "sampling='gauss'")
     assert plans[0].warnings == plans[1].warnings
-    assert len(about(caplog.messages, "restless velocities")) == 1
+    assert len(about(caplog.messages, "replay")) == 1
     for text in (str(plans[0]), plans[0].table(), plans[0]._repr_html_()):
-        assert about(text, "restless velocities")
+        assert about(text, "replay")
     assert vp.solve(problem, check=False).warnings == ()
-
-
-def test_held_controls_alone_are_no_chatter():
-    """Within a decision velocities bend to and fro, as controls jump from decision to decision."""
-    for seed in range(3):
-        plan = vp.solve(reach(vp.planar_chain(2), seed, hold=2))
-        assert plan.status.converged
-        assert plan.warnings == ()
-
-
-def test_a_plan_that_whirls_says_so_and_how_to_calm_it(load):
-    """A cost at the end alone, and cheap controls: the optimum makes use of what nothing weighs."""
-    problem = reach(load("ur10"), 0)
-    goal = sum(term for term in problem.cost.terms if term.at_end)
-    whirling, calm = (
-        vp.solve(
-            vp.OptimalControlProblem(problem.scene, cost, problem.q0, problem.v0, dt=problem.dt, steps=problem.steps)
-        )
-        for cost in (vp.ControlCost(1e-3) + goal, vp.ControlCost(1e-3) + goal + vp.VelocityCost(0.01))
-    )
-    most = changes(whirling.trajectory)
-    assert most.max() > 12 >= changes(calm.trajectory).max()
-    name = load("ur10").joint_names[most.argmax()]
-    told = about(whirling.warnings, "restless velocities")
-    assert told == naming(told, name, str(most.max()))
-    assert len(told) == 1
-    assert "VelocityCost" in told[0]
-    assert not about(calm.warnings, "restless velocities")
 
 
 def test_dampers_faster_than_the_step(load):
@@ -178,49 +142,10 @@ def test_warnings_go_through_files(tmp_path, load):
     assert findings(again) == plan.warnings
 
 
-def test_restlessness():
-    t = np.arange(101.0)
-    smooth, fast = np.sin(0.05 * t), np.sin(t)
-    # Sixteen waves in a hundred steps, each with a top and a bottom.
-    assert restlessness(np.stack([smooth, smooth + 2.0 * fast, 0.0 * t], axis=1)) == (1, 32)
-    assert restlessness(fast[:41, None]) == (0, 13)
-    # Slower, too small to show, beside what moves, in few steps.
-    calm = [np.sin(0.3 * t), smooth + 5e-4 * fast, fast[:12], fast[:2]]
-    calm_columns = [own[:, None] for own in calm] + [np.stack([smooth, 1e-9 * fast], axis=1), np.zeros((3, 0))]
-    assert [restlessness(v) for v in calm_columns] == [None] * 6
-
-
-def light_cart(mass):
-    """A slider of a given mass [kg]."""
-    import pinocchio as pin  # noqa: PLC0415
-
-    model = pin.Model()
-    model.appendBodyToJoint(
-        model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "cart"),
-        pin.Inertia(mass, np.zeros(3), 0.01 * np.eye(3)),
-        pin.SE3.Identity(),
-    )
-    return vp.Scene(vp.load_robot(model), gravity=False)
-
-
-def test_a_controller_too_fast_for_its_period_is_told():
-    """Planned for 1 kg, the loop turns the velocity of 0.52 kg round in every tick."""
-    cost = vp.TrackingCost([0.0], 1.0) + vp.VelocityCost(10.0) + vp.ControlCost(1e-6)
-    problem = vp.OptimalControlProblem(light_cart(1.0), cost, [1.0], [0.3], dt=0.05, steps=20)
-    mpc = vp.Mpc(problem)
-    good, bad = mpc.run(duration=1.0), mpc.run(vp.Plant(light_cart(0.52)), duration=1.0)
-    # A slow machine may take longer than the period.
-    assert set(good.warnings) == set(about(good.warnings, "late plans"))
-    assert about(bad.warnings, "restless ticks")
-    assert about(str(bad), "restless ticks")
-    assert about(bad._repr_html_(), "restless ticks")
-
-
 def held(plan):
-    """Whether a plan is what must hold: no chatter, and what the robot pays is what was planned."""
+    """Whether what the robot pays is what was planned."""
     truth = plan.verify(tolerance=1e-6, max_substeps=256)
-    calm = 100 * changes(plan.trajectory).max() / plan.problem.steps <= 12
-    return calm and (truth.open_loop_loss < 1e-3 or truth.closed_loop_loss < 1e-3)
+    return truth.open_loop_loss < 1e-3 or truth.closed_loop_loss < 1e-3
 
 
 @pytest.mark.slow

@@ -22,18 +22,6 @@ def reach(*extra, factor=1.0, noise=None, **options):
     return vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], **{"dt": 0.02, "steps": 50, **options})
 
 
-# These grids are coarse for the midpoint rule.
-MIDPOINT = {"integrator": vp.Midpoint(), "sampling": "midpoint"}
-
-
-def swing(steps):
-    """A swing on a grid so coarse that steps are taken in parts: up to 7 with 20 steps."""
-    end = vp.TrackingCost([-np.pi / 2, 0.0], 100.0) + vp.VelocityCost(5.0)
-    cost = vp.ControlCost(0.1) + vp.VelocityCost(0.01) + vp.Terminal(end)
-    scene = vp.Scene(vp.planar_chain(2))
-    return vp.OptimalControlProblem(scene, cost, [np.pi / 2, 0.0], [0, 0], dt=2.0 / steps, steps=steps, **MIDPOINT)
-
-
 def constant(value):
     return vp.CustomCost(lambda t, q, v, u: np.full(len(t), value), name="constant")
 
@@ -69,30 +57,6 @@ def test_a_constant_changes_nothing(extra, grid):
     assert plain.status is vp.Status.CONVERGED
     assert_same_search(plain, other)
     assert numbers(plain.reason) == numbers(other.reason)
-
-
-@pytest.mark.parametrize("value", [1e6, -1e6])
-def test_a_constant_inside_a_cost_of_ones_own_changes_nothing(value):
-    hessian = np.diag([2.0, 2.0, 0.0, 0.0, 0.2, 0.2])[None]
-
-    def problem(offset):
-        def function(t, q, v, u):
-            return offset + ((q - GOAL) ** 2).sum(axis=1) + 0.1 * (u**2).sum(axis=1)
-
-        def derivatives(t, q, v, u):
-            return np.hstack([2.0 * (q - GOAL), 0.0 * v, 0.2 * u]), hessian
-
-        scene = vp.Scene(vp.planar_chain(2), damping=0.1)
-        return vp.OptimalControlProblem(scene, vp.CustomCost(function, derivatives), [0, 0], [0, 0], dt=0.02, steps=50)
-
-    plain = vp.solve(problem(0.0))
-    assert plain.status is vp.Status.CONVERGED
-    assert_same_search(plain, vp.solve(problem(value)), rtol=1e-9)
-    # The same as costs that varpin knows.
-    known = vp.TrackingCost(GOAL) + vp.ControlCost(0.1)
-    scene = vp.Scene(vp.planar_chain(2), damping=0.1)
-    known = vp.solve(vp.OptimalControlProblem(scene, known, [0, 0], [0, 0], dt=0.02, steps=50))
-    assert_same_search(known, plain, rtol=1e-9)
 
 
 def test_a_long_chain_converges_with_the_defaults():
@@ -201,19 +165,9 @@ def test_each_line_of_the_log_names_its_search(caplog):
     assert [record.getMessage() for record in caplog.records] == lines
 
 
-def swing_up(*, change=None, **options):
-    """Two links swing up: without second derivatives of the dynamics the model is too steep."""
-    swing = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
-    swing += vp.Terminal(vp.TrackingCost([-np.pi / 2, 0.0], 1e3) + vp.VelocityCost(1e2))
-    if change is not None:
-        swing += vp.ControlRateCost(change)
-    options = {"dt": 0.05, "steps": 40, "integrator": vp.RungeKutta4(), "control_limits": (-20.0, 20.0)} | options
-    return vp.OptimalControlProblem(vp.Scene(vp.planar_chain(2)), swing, [np.pi / 2, 0.0], np.zeros(2), **options)
-
-
-@pytest.mark.parametrize("iterations", [17, 20, 23, 26])
+@pytest.mark.parametrize("iterations", [2, 5])
 def test_a_given_first_control_stays_exactly_as_it_is(iterations):
     before = np.random.default_rng(0).uniform(-5.0, 5.0, 2)
-    problem = swing_up(controls="linear", constraints=[vp.WithinControlRate(400.0, before=before)])
+    problem = reach(controls="linear", constraints=[vp.WithinControlRate(400.0, before=before)])
     plan = vp.solve(problem, max_iterations=iterations, check=False)
     np.testing.assert_array_equal(plan.trajectory.u_nodes[0], before)

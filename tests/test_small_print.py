@@ -61,10 +61,9 @@ def test_a_checked_linearization_has_a_verdict():
     assert about(str(good).splitlines()[-1], "right derivatives")
     coarse = vp.check_linearization(vp.Scene(chain, damping=0.1), q, v, dt=1e-2, step=1.0)
     assert not coarse.holds
-    assert about(str(coarse), "another difference", "wrong derivatives")
+    assert about(str(coarse), "another difference")
     wrong = type(good)(A=good.A, B=(0.5, 1.0), G=good.G)
-    (verdict,) = about(str(wrong).splitlines()[-1], "wrong derivatives")
-    assert not unnamed(verdict, "B", "5.0e-01")
+    assert not unnamed(str(wrong).splitlines()[-1], "B", "5.0e-01")
 
 
 @pytest.mark.parametrize(
@@ -101,25 +100,20 @@ def plan_problem(**horizon):
     return vp.OptimalControlProblem(vp.Scene(vp.planar_chain(2)), cost, [0.0, 0.0], [0.0, 0.0], **horizon)
 
 
-@pytest.mark.parametrize("horizon", [{"dt": 0.02, "duration": 0.6}, {"steps": 30, "duration": 0.6}])
-def test_a_problem_has_the_time_that_it_is_given(horizon):
-    one, other = plan_problem(dt=0.02, steps=30), plan_problem(**horizon)
-    assert (other.dt, other.steps) == (one.dt, one.steps)
-    assert vp.solve(other).trajectory.u.tobytes() == vp.solve(one).trajectory.u.tobytes()
-
-
 @pytest.mark.parametrize(
-    ("change", "dt", "steps"),
+    ("horizon", "change", "dt", "steps"),
     [
-        ({"dt": 0.01}, 0.01, 60),
-        ({"duration": 1.2}, 0.02, 60),
-        ({"duration": 1.2, "steps": 30}, 0.04, 30),
-        ({"duration": 1.2, "dt": 0.04}, 0.04, 30),
-        ({"dt": 0.1, "steps": 3}, 0.1, 3),
+        ({"dt": 0.02, "duration": 0.6}, {}, 0.02, 30),
+        ({"steps": 30, "duration": 0.6}, {}, 0.02, 30),
+        ({"dt": 0.02, "steps": 30}, {"dt": 0.01}, 0.01, 60),
+        ({"dt": 0.02, "steps": 30}, {"duration": 1.2}, 0.02, 60),
+        ({"dt": 0.02, "steps": 30}, {"duration": 1.2, "steps": 30}, 0.04, 30),
+        ({"dt": 0.02, "steps": 30}, {"duration": 1.2, "dt": 0.04}, 0.04, 30),
+        ({"dt": 0.02, "steps": 30}, {"dt": 0.1, "steps": 3}, 0.1, 3),
     ],
 )
-def test_a_problem_at_another_time(change, dt, steps):
-    other = plan_problem(dt=0.02, steps=30).at(**change)
+def test_a_problem_has_the_time_that_it_is_given(horizon, change, dt, steps):
+    other = plan_problem(**horizon).at(**change)
     assert (other.dt, other.steps) == (dt, steps)
     assert other.duration == pytest.approx(dt * steps, rel=1e-15)
 

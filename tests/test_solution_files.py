@@ -99,12 +99,3 @@ def test_resume_of_something_else():
         vp.solve(problem, plan, resume=plan)
     with refused(vp.InputError, "Solution"):
         vp.solve(problem, resume=plan.trajectory)
-
-
-def test_a_motion_with_an_infinite_energy_defect_is_read_again(tmp_path):
-    problem = problem_of()
-    plan = vp.solve(problem, max_iterations=1)
-    statistics = dataclasses.replace(plan.trajectory.statistics, energy_defect=np.full(plan.trajectory.steps, np.inf))
-    away = dataclasses.replace(plan, trajectory=dataclasses.replace(plan.trajectory, statistics=statistics))
-    loaded = vp.Solution.load(away.save(tmp_path / "away.npz"), problem)
-    assert np.isposinf(loaded.trajectory.statistics.energy_defect).all()

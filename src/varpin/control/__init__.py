@@ -1,6 +1,5 @@
 """S-DDP: optimal control under noise, within limits and constraints, on any integrator's linearization."""
 
-from varpin.control.checks import looked_at as looked_at
 from varpin.control.history import Iteration as Iteration
 from varpin.control.history import Refined as Refined
 from varpin.control.history import Refinement as Refinement
@@ -12,7 +11,6 @@ from varpin.control.multipliers import ConstraintReport as ConstraintReport
 from varpin.control.multipliers import Multipliers as Multipliers
 from varpin.control.problem import OptimalControlProblem as OptimalControlProblem
 from varpin.control.solution import Solution as Solution
-from varpin.control.solution import Violations as Violations
 from varpin.control.solution_file import solution_trajectory as solution_trajectory
 from varpin.control.solving import solve as solve
 from varpin.control.verification import Verification as Verification

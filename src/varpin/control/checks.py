@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -20,16 +21,15 @@ from varpin.control.constraints import (
     WithinJointLimits,
 )
 from varpin.control.costs import FramePositionCost, TrackingCost, weight_matrix
-from varpin.control.history import ITERATIONS, Status
 from varpin.control.margins import too_small
-from varpin.control.multipliers import FEASIBLE, REPORTED, at_nodes
+from varpin.control.multipliers import FEASIBLE, REPORTED
 from varpin.control.noise import covariances, noise_cost
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
 from varpin.control.stages import Feedback, Steps
 from varpin.control.verification import Played, at_start, excess, in_parts, percent, played
 from varpin.errors import VarpinError
-from varpin.finding import Finding, announce
+from varpin.finding import Finding, announce, ranked
 from varpin.linearization import wrong_variances
 from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import closest_controls
@@ -51,72 +51,49 @@ from varpin.simulation.start import in_other_units
 
 logger = logging.getLogger(__name__)
 
-# Kinds of findings about goals in wrong units.
-_UNITS = ("goal in millimetres", "goal in degrees")
 # Parts of a step in which a plan is played again.
 PARTS = 4
-# Greatest relative excess over the plan's cost, and shortfall, without a warning: in parts of its steps, and of what a
-# stalled search foresees.
+# Greatest relative excess over the plan's cost, and shortfall, in parts of its steps without a warning.
 LOSS, GAIN = 1e-3, 1e-2
 # Part of the expected cost by which noise may cost other than planned in half steps without a warning.
 _NOISE_OFF = 0.02
 # Standard deviation of a velocity, in widths of its dry friction, up to which tanh is linear to 6 %.
 _LINEAR_FRICTION = 0.25
-# Least change of a velocity that counts as restlessness, as a share of the joint's largest velocity, and of the largest
-# of all joints. Changes of sign from which on a warning is given: a share of the decisions, and at least a number, as
-# each end of a motion under held controls has five or six, whatever the number of steps.
-_CHANGE, _IDLE, _RESTLESS, _FEWEST = 1e-3, 1e-6, 0.12, 13
 # Share of the torque that holds a posture which limits may be short of without a word.
 _SHARE_OF_WEIGHT = 0.01
 # Tolerance on positions and joint limits [m or rad].
 _SAME = 1e-6
 
 
-def looked_at(solution: Solution, before: Sequence[Finding] | None = None) -> tuple[Solution, tuple[Finding, ...]]:
-    """Check a solution: returns it with its warnings, and the findings.
-
-    The log has each warning once for a scene and a time step. Ctrl-C ends the checks and keeps the plan. ``before`` are
-    the findings of :func:`foreseen` about its problem, where they are known.
-    """
+def looked_at(solution: Solution) -> Solution:
+    """A solution with its warnings. The log has each once for a scene and a step. Ctrl-C ends the checks alone."""
     try:
-        found = findings(solution, before)
+        found = findings(solution)
     except KeyboardInterrupt:
         found = (Finding("interrupted", "interrupted before the plan was played again: its accuracy is not known"),)
     announce(logger, solution.problem.scene.announced, solution.problem.dt, found)
-    return replace(solution, warnings=found), found
+    return replace(solution, warnings=found)
 
 
-def findings(solution: Solution, before: Sequence[Finding] | None = None) -> tuple[Finding, ...]:
-    """Findings about a plan: its limits, convergence, noise, velocities, and its cost and constraints within steps."""
+def findings(solution: Solution) -> tuple[Finding, ...]:
+    """Findings about a plan: its limits, its noise, and its cost and constraints within steps."""
     problem, motion = solution.problem, solution.trajectory
     policy = solution.policy_on("momentum" if problem.integrator.variational else "velocity")
     of_motion = check(problem.scene, problem.integrator, motion, policy).warnings
-    found = [*(foreseen(problem) if before is None else before)]
-    found += [finding for finding in of_motion if finding.kind != "error"]
-    if solution.refinement is not None and not solution.refinement.met:
+    found = [*foreseen(problem), *(finding for finding in of_motion if finding.kind != "error")]
+    met = solution.refinement is not None and solution.refinement.met
+    if solution.refinement is not None and not met:
         found.append(Finding("true cost", solution.refinement.reason))
-    found += [*_unfinished(solution), *_noise(solution), *_restless(motion.joint_names, motion.v[:: problem.hold])]
+    found += _noise(solution)
     try:
         again = _again(solution)
     except VarpinError as error:
         return *found, Finding("replay", f"the plan cannot be replayed in steps of {1.0 / PARTS:g} dt: {error}")
     found += _between(solution, again)
     # A plan that is as true as it was wished to be has been looked at already.
-    if (solution.refinement is None or not solution.refinement.met) and (dearer := _dearer(solution, again)):
+    if not met and (dearer := _dearer(solution, again)):
         found += [dearer, *(finding for finding in of_motion if finding.kind == "error")]
     return tuple(found)
-
-
-def _unfinished(solution: Solution) -> Iterator[Finding]:
-    """A finding if the search ended before it converged, though not as the user asked for few iterations."""
-    history = solution.history
-    ended = solution.status in (Status.STALLED, Status.INDEFINITE, Status.NOT_DIFFERENTIABLE)
-    if not (ended or (solution.status is Status.MAX_ITERATIONS and len(history) >= ITERATIONS)) or not history:
-        return
-    # With a negligible expected decrease the plan is as good as converged, if it keeps to its constraints.
-    little = history[-1].expected_decrease <= LOSS * abs(solution.cost) and solution.violation <= FEASIBLE
-    if not (solution.status is Status.STALLED and little):
-        yield Finding("not converged", f"the search ended before it converged: {solution.reason}")
 
 
 # Before the search
@@ -124,20 +101,17 @@ def _unfinished(solution: Solution) -> Iterator[Finding]:
 
 def foreseen(problem: OptimalControlProblem) -> list[Finding]:
     """Findings about a problem before any search; where values are in wrong units, these alone."""
-    units = [*in_other_units(problem.scene, problem.q0)]
-    goals = [*_goals(problem), *_ends(problem)]
-    units += [*_in_degrees(problem), *_in_millimetres(problem), *(own for own in goals if own.kind in _UNITS)]
-    return units or [*_starts_outside(problem), *goals, *_weights(problem)]
+    goals = [*_goals(problem)]
+    units = [*in_other_units(problem.scene, problem.q0), *_in_degrees(problem), *_in_millimetres(problem)]
+    units += [own for own in goals if own.kind == "goal in millimetres"]
+    return [*ranked(units)] or [*_starts_outside(problem), *goals, *_outside(problem), *_weights(problem)]
 
 
 def _starts_outside(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Constraints that the start violates, so that the first step has to satisfy them."""
     for bound in problem.bound_constraints:
         c = at_start(problem, bound)
-        if c is None:
-            continue
-        row = int(np.argmax(c))
-        if c[row] > REPORTED * bound.scale:
+        if c is not None and c[row := int(np.argmax(c))] > REPORTED * bound.scale:
             sentence = (
                 f"the start is outside {problem.label_of(bound.source)}, {bound.rows[row]} by {c[row]:.2g} "
                 f"{bound.unit}, and the first node has to be inside: begin inside, or widen the bound"
@@ -147,22 +121,20 @@ def _starts_outside(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Goals and targets that their frame cannot reach."""
-    robot, places = problem.scene.robot, []
-    for goal in problem.constraints:
-        if isinstance(goal, ReachFrame) and goal.position is not None:
-            places.append((goal.label, goal.frame, np.eye(3), goal.position))
+    robot, places = problem.scene.robot, {}
     for term in problem.cost.terms:
         if isinstance(term, FramePositionCost) and not callable(term.target):
             strengths, axes = np.linalg.eigh(weight_matrix("FramePositionCost", term.weight, 3))
             weighed = axes[:, strengths > _SAME * strengths[-1]]
-            places.append((f"FramePositionCost({term.frame!r})", term.frame, weighed, np.asarray(term.target)))
-    told = set()
-    for label, frame, axes, place in places:
+            places[f"FramePositionCost({term.frame!r})"] = term.frame, weighed, np.asarray(term.target)
+    for goal in problem.constraints:
+        if isinstance(goal, ReachFrame) and goal.position is not None:
+            places[goal.label] = goal.frame, np.eye(3), goal.position
+    for label, (frame, axes, place) in places.items():
         kinematics = frame_kinematics(robot, frame)
         most, root = reach(robot, kinematics), kinematics.links.tree.translation[0]
         away = float(np.linalg.norm((np.atleast_2d(place) - root) @ axes, axis=1).max())
-        if away > most * (1.0 + _SAME) and label not in told:
-            told.add(label)
+        if away > most * (1.0 + _SAME):
             kind, why = "goal out of reach", "no motion gets there"
             if away > AFAR * most:
                 kind, why = "goal in millimetres", IN_MILLIMETRES
@@ -203,22 +175,19 @@ def _postures(problem: OptimalControlProblem) -> Iterator[Floats]:
             yield end
 
 
-def _ends(problem: OptimalControlProblem) -> Iterator[Finding]:
-    """Goal configurations that look like degrees, or are outside of joint limits."""
+def _outside(problem: OptimalControlProblem) -> Iterator[Finding]:
+    """Goal configurations outside of joint limits."""
     robot = problem.scene.robot
-    for end in _postures(problem):
-        if sentence := degrees_hint(robot, "the goal of the terminal TrackingCost", end):
-            yield Finding("goal in degrees", sentence)
-        for limits in problem.constraints:
-            if isinstance(limits, WithinJointLimits):
-                beyond = np.maximum(end - limits.limits[1], limits.limits[0] - end)
-                joint = int(np.argmax(beyond))
-                if beyond[joint] > _SAME:
-                    sentence = (
-                        f"the terminal TrackingCost has its goal for {robot.joint_names[joint]} {beyond[joint]:.4g} "
-                        f"{joint_unit(robot, joint)} outside {limits.label}, where the plan will not end"
-                    )
-                    yield Finding("goal outside constraints", sentence)
+    limits = [item for item in problem.constraints if isinstance(item, WithinJointLimits)]
+    for end, (own, (lower, upper)) in itertools.product(_postures(problem), ((item, item.limits) for item in limits)):
+        beyond = np.maximum(end - upper, lower - end)
+        joint = int(np.argmax(beyond))
+        if beyond[joint] > _SAME:
+            sentence = (
+                f"the terminal TrackingCost has its goal for {robot.joint_names[joint]} {beyond[joint]:.4g} "
+                f"{joint_unit(robot, joint)} outside {own.label}, where the plan will not end"
+            )
+            yield Finding("goal outside constraints", sentence)
 
 
 def _weights(problem: OptimalControlProblem) -> Iterator[Finding]:
@@ -241,28 +210,28 @@ def _weights(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 
 def _in_degrees(problem: OptimalControlProblem) -> Iterator[Finding]:
-    """Limits of joints that look like degrees."""
+    """Goal configurations and limits of joints that look like degrees."""
     robot = problem.scene.robot
-    for limits in problem.constraints:
-        if not isinstance(limits, WithinJointLimits):
-            continue
-        # Limits of the robot's description are in radians, however wide.
-        given = np.isfinite(limits.limits) & (limits.limits != robot.position_limits) & ~robot.slides
-        most = np.where(given, np.abs(limits.limits), 0.0).max(axis=0)
-        joint = int(np.argmax(most))
-        if looks_like_degrees(most[joint]):
-            sentence = (
-                f"{limits.label} lets {robot.joint_names[joint]} turn to {most[joint]:.4g} rad, "
-                f"{most[joint] / (2.0 * np.pi):.0f} turns, and looks like degrees: {ADVICE}"
-            )
-            yield Finding("limits in degrees", sentence)
+    for end in _postures(problem):
+        if sentence := degrees_hint(robot, "the goal of the terminal TrackingCost", end):
+            yield Finding("goal in degrees", sentence)
+    for own in problem.constraints:
+        if isinstance(own, WithinJointLimits):
+            # Limits of the robot's description are in radians, however wide.
+            given = np.isfinite(own.limits) & (own.limits != robot.position_limits) & ~robot.slides
+            most = np.where(given, np.abs(own.limits), 0.0).max(axis=0)
+            joint = int(np.argmax(most))
+            if looks_like_degrees(most[joint]):
+                name = robot.joint_names[joint]
+                sentence = f"{own.label} lets {name} turn to {most[joint]:.4g} rad, and looks like degrees: {ADVICE}"
+                yield Finding("limits in degrees", sentence)
 
 
 def _in_millimetres(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Obstacles and regions whose places or sizes look like millimetres."""
     robot = problem.scene.robot
     for constraint in problem.constraints:
-        lengths = _lengths(constraint)
+        lengths = {f"{type(constraint).__name__}: {name}": size for name, size in _lengths(constraint).items()}
         sentence = millimetres_hint(robot, lengths) if lengths else ""
         if isinstance(constraint, KeepClear) and not sentence:
             sentence = millimetres_hint(robot, {"KeepClear: distance": abs(constraint.distance)}, ASIDE)
@@ -272,49 +241,29 @@ def _in_millimetres(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 def _lengths(constraint: PlanConstraint) -> dict[str, float]:
     """Names of a constraint's lengths, and their sizes [m]; places count by their distance from the robot's root."""
-    name, found = type(constraint).__name__, {}
+    found: dict[str, float] = {}
     if isinstance(constraint, KeepClear):
         root = constraint.robot.tree.translation[0]
         for body in constraint.obstacles:
-            label = f"{name}: the obstacle {body.name!r}"
-            found[f"{label}: its distance"] = float(min(np.linalg.norm(x - root) for x in (body.begin, body.end)))
-            sides = body.sides if body.hull is None else body.hull.sides
-            found[f"{label}: its radius or side"] = body.radius if sides is None else float(sides.max())
+            away, sides = np.linalg.norm([body.begin - root, body.end - root], axis=1), body.sides
+            sides = sides if body.hull is None else body.hull.sides
+            found[f"the obstacle {body.name!r}: its distance"] = float(away.min())
+            found[f"the obstacle {body.name!r}: its radius or side"] = body.radius if sides is None else sides.max()
     elif isinstance(constraint, KeepInSphere | KeepOutOfSphere):
-        found = {f"{name}: radius": constraint.radius}
+        found["radius"] = constraint.radius
         if not callable(constraint.center):
             root = constraint.robot.tree.translation[0]
-            found[f"{name}: the distance of its centre"] = float(np.linalg.norm(constraint.center - root))
+            found["the distance of its centre"] = float(np.linalg.norm(constraint.center - root))
     elif isinstance(constraint, KeepInHalfSpace):
-        found = {f"{name}: offset": abs(constraint.offset)}
+        found["offset"] = abs(constraint.offset)
     elif isinstance(constraint, KeepInBox):
         # One far side may stand for none.
         sides = np.abs(constraint.limits[np.isfinite(constraint.limits)])
-        found = {f"{name}: its nearest side": float(sides[sides > 0.0].min(initial=np.inf)) if sides.any() else 0.0}
+        found["its nearest side"] = float(np.min(sides, initial=np.inf, where=sides > 0.0)) if sides.any() else 0.0
     return found
 
 
 # The finished plan
-
-
-def _restless(joints: Sequence[str], v: Floats) -> Iterator[Finding]:
-    """A finding if a velocity goes up and down at decisions (R, n), as it does where the cost hardly weighs it."""
-    if (restless := restlessness(v)) is not None:
-        joint, changes = restless
-        sentence = (
-            f"the velocity of {joints[joint]} goes up and down {changes} times in {len(v) - 1} decisions, which the "
-            "cost hardly weighs: a larger running VelocityCost, or sampling='gauss', calms it"
-        )
-        yield Finding("restless velocities", sentence, joints[joint], value=float(changes))
-
-
-def restlessness(v: Floats) -> tuple[int, int] | None:
-    """The joint whose velocity (N + 1, n) turns round most often and how often, if that is worth a warning."""
-    fastest, change = np.abs(v).max(axis=0, initial=0.0), np.diff(v, axis=0)
-    counts = np.abs(change) > np.maximum(_CHANGE * fastest, _IDLE * fastest.max(initial=0.0))
-    turns = ((change[1:] * change[:-1] < 0.0) & counts[1:] & counts[:-1]).sum(axis=0)
-    most = int(turns.max(initial=0))
-    return (int(turns.argmax()), most) if most >= max(_FEWEST, _RESTLESS * len(change)) else None
 
 
 def _again(solution: Solution) -> list[Played]:
@@ -326,11 +275,10 @@ def _again(solution: Solution) -> list[Played]:
     Raises:
         VarpinError: A custom cost or noise field fails off the plan.
     """
-    problem, known = solution.problem, solution.multipliers
-    margins = None if known is None else at_nodes(problem, known, known.backoff)
-    fine, by = problem.in_parts(PARTS), problem.integrator
+    problem, by = solution.problem, solution.problem.integrator
+    fine = problem.in_parts(PARTS)
     commands = in_parts(problem, solution.controls, solution.policy_on, by, PARTS)
-    return [played(problem, fine, each, by, margins) for each in commands]
+    return [played(problem, fine, each, by) for each in commands]
 
 
 def _dearer(solution: Solution, again: Sequence[Played]) -> Finding | None:
@@ -406,29 +354,26 @@ def _noise(solution: Solution) -> Iterator[Finding]:
 
 def _friction(solution: Solution) -> Iterator[Finding]:
     """A finding if noise moves a joint by more than its dry friction is linear for."""
-    problem, motion, worst = solution.problem, solution.trajectory, _LINEAR_FRICTION
-    rubbing, n = of_kind(problem.scene.elements, "CoulombFriction"), problem.scene.robot.dof
+    problem, motion, n = solution.problem, solution.trajectory, solution.problem.scene.robot.dof
+    rubbing = of_kind(problem.scene.elements, "CoulombFriction")
     if not rubbing:
         return
     steps = Steps(problem, motion)
-    P, slopes = covariances(steps, Feedback(solution.gains, solution.previous_gains)), steps.slopes
-    spread = np.sqrt(np.maximum(np.einsum("kvx,kxy,kvy->kv", slopes[:, n:], P, slopes[:, n:]), 0.0))
-    found = None
-    for element in rubbing:
-        c, width = element.coordinate, element.values[1]
-        # At speed dry friction is constant, and noise changes it little.
-        slow = np.abs(motion.v[:, c]) < 3.0 * (width + spread[:, c])
-        ratio = float((spread[slow, c] / width).max(initial=0.0))
-        if ratio > worst:
-            worst, name = ratio, motion.joint_names[c]
-            sentence = (
-                f"noise moves joint {name!r} by {ratio:.2g} widths of its dry friction ({width:g} "
-                f"{joint_unit(problem.scene.robot, c, speed=True)}), which noise_cost, gains and margins take as "
-                "linear: use plan.monte_carlo()"
-            )
-            found = Finding("friction under noise", sentence, name, value=ratio, unit="widths")
-    if found is not None:
-        yield found
+    of_speeds = steps.slopes[:, n:]
+    P = covariances(steps, Feedback(solution.gains, solution.previous_gains))
+    spread = np.sqrt(np.maximum(np.einsum("kvx,kxy,kvy->kv", of_speeds, P, of_speeds), 0.0))
+    joints, widths = [own.coordinate for own in rubbing], np.array([own.values[1] for own in rubbing])
+    # At speed dry friction is constant, and noise changes it little.
+    slow = np.abs(motion.v[:, joints]) < 3.0 * (widths + spread[:, joints])
+    ratios = np.where(slow, spread[:, joints] / widths, 0.0).max(axis=0)
+    worst = int(ratios.argmax())
+    if ratios[worst] > _LINEAR_FRICTION:
+        name, unit = motion.joint_names[joints[worst]], joint_unit(problem.scene.robot, joints[worst], speed=True)
+        sentence = (
+            f"noise moves joint {name!r} by {ratios[worst]:.2g} widths of its dry friction ({widths[worst]:g} {unit}), "
+            "which noise_cost, gains and margins take as linear: use plan.monte_carlo()"
+        )
+        yield Finding("friction under noise", sentence, name, value=float(ratios[worst]), unit="widths")
 
 
 def _in_halves(solution: Solution) -> Iterator[Finding]:

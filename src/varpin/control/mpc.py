@@ -11,22 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
-from varpin.control import OptimalControlProblem, Solution, looked_at, solve
+from varpin.control import OptimalControlProblem, Solution, solve
 from varpin.control.between_nodes import enforced, middles
-from varpin.control.checks import restlessness
 from varpin.control.constraints import BoundRate
 from varpin.control.costs import CostError
 from varpin.control.history import Status
 from varpin.control.multipliers import REPORTED, ConstraintReport, Multipliers, at_nodes, flat
-from varpin.control.rollout import shifted_commands
+from varpin.control.rollout import first_commands
 from varpin.control.search import Search
-from varpin.control.solution import rest_of
 from varpin.errors import InputError, LinearizationError
 from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
 from varpin.integrators.base import Failure
 from varpin.mechanics.noise import NoiseFieldError
-from varpin.mechanics.scene import Scene, closest_controls, require_scene
+from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import generator, wiener_increments
 from varpin.signals.commands import in_parts_of_steps, with_ends
 from varpin.signals.policy import FirstOrderHold
@@ -47,6 +45,8 @@ logger = logging.getLogger(__name__)
 
 # Share of late ticks without a warning: other programs on the machine cause a few.
 _FEW = 0.05
+# Violation, in tenths of a constraint's range, that one or two iterations of a tick may leave; from 0.1 to 0.3.
+_MISSED = 0.1
 
 
 @dataclass(frozen=True)
@@ -87,9 +87,8 @@ class MpcRun(Frozen):
         constraints: How well the plant's motion satisfied each of the problem's constraints at its nodes, without
             margins; goals, which apply to the end of each plan, are left out.
         warnings: Warnings about the first plan that do not recur in the plant's motion; about the motion, as in
-            :attr:`Trajectory.warnings`, and its velocities from tick to tick; about planning that took longer than the
-            budget or the period in more than one tick of twenty; about failed ticks; and about
-            constraints that plans or the motion violated.
+            :attr:`Trajectory.warnings`; about planning that took longer than the budget or the period in more than one
+            tick of twenty; about failed ticks; and about constraints that plans or the motion violated.
     """
 
     motion: Trajectory
@@ -105,7 +104,7 @@ class MpcRun(Frozen):
 
     @property
     def infeasible(self) -> NDArray[np.bool_]:
-        """Ticks whose plan violates a constraint by more than a thousandth of its range (K,)."""
+        """Ticks whose plan violates a constraint by more than a hundredth of its range (K,)."""
         return np.array([any(_violated(plan)) for plan in self.plans])
 
     def planned(self, ahead: float | None = None) -> Floats:
@@ -173,8 +172,8 @@ class Mpc:
     Constraints hold along every horizon, and moving obstacles are predicted. Each iteration of a tick meets their
     linearization, so a plan satisfies them to the accuracy of few iterations, which ``Solution.violation`` has. A goal
     (:class:`ReachFrame`) applies to the end of every horizon. The size of a margin is that of the first plan. After the
-    first plan held controls keep to constraints at the nodes alone, whatever ``between_nodes`` says, linear ones at the
-    middles of steps, too.
+    first plan constraints also hold in the middles of steps with ``between_nodes`` or linear controls, and else at the
+    nodes.
 
     Main args:
         problem: The problem. Its horizon, discretization, noise, limits and constraints apply to every tick, its
@@ -185,9 +184,8 @@ class Mpc:
         tolerance: Tolerance of the search; see :func:`varpin.solve`.
         budget: Time for planning in a tick [s]. No iteration begins that would exceed it if it took as long as the
             longest one of the tick. A late plan is discarded, and so is a failure to find one by then: the previous
-            plan acts with its feedback, and ``MpcRun.late`` marks the tick. Beyond that plan's horizon the robot is
-            brought to rest where the plan ends, if every joint can be driven; else the last decision is repeated.
-            Results then depend on the machine. With an infinite budget they do not.
+            plan acts with its feedback, and ``MpcRun.late`` marks the tick. Results then depend on the machine. With
+            an infinite budget they do not.
     """
 
     problem: OptimalControlProblem
@@ -257,9 +255,10 @@ class Mpc:
                 before = previous.controls[min(last, len(previous.controls) - 1)]
         problem = self.problem.at(q0=q, v0=v, t0=t, before=before)
         if previous is None:
-            return self._first_plan(problem)[0]
+            return solve(problem, tolerance=self.tolerance)
         search = Search(problem, tick=True)
-        search.begin(shifted_commands(problem, previous, min(decisions, problem.decisions - 1)))
+        rest = previous.shifted(min(decisions, problem.decisions - 1), None if problem.rate is None else before)
+        search.begin(first_commands(problem, rest))
         if previous.search is not None:
             search.weight = previous.search.weight
         if previous.multipliers is not None and problem.constraints:
@@ -270,10 +269,6 @@ class Mpc:
             status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
         # A tick does not check its plan; the run checks the motion that results.
         return search.solution(status)
-
-    def _first_plan(self, problem: OptimalControlProblem) -> tuple[Solution, tuple[Finding, ...]]:
-        """The first plan of a run and the findings about it."""
-        return looked_at(solve(problem, tolerance=self.tolerance, check=False))
 
     @one_thread()
     def run(
@@ -288,7 +283,7 @@ class Mpc:
 
         In each tick the first decision of the plan made from the state at its beginning acts, or, where controls are
         linear between nodes, the line between its first two. The first plan is made before the run. Where a search
-        finds no plan, the one before acts on with its feedback, up to its end, and a warning says so.
+        finds no plan in time, the one before acts on with its feedback, up to its end.
 
         Main args:
             plant: None for the problem's own scene, integrated more finely.
@@ -302,9 +297,8 @@ class Mpc:
 
         Raises:
             InputError: A plant with other controls or joints.
-            StepFailure: The plant's motion cannot be integrated. Or no search has found a plan for the whole horizon of
-                the last one: first motions cannot be integrated, plans not be linearized, or their models have no
-                minimum. Its cause is the last search's error, if that raised one. It holds the plant's motion so far.
+            StepFailure: The plant's motion cannot be integrated. Or all ticks of a plan's horizon were late or without
+                a plan; its cause is the last search's error, if that raised one. It holds the plant's motion so far.
             CostError: A custom cost fails; from the second tick on it holds the plant's motion so far.
             Interrupted: Ctrl-C; holds the plant's motion so far. In the first plan, a plain KeyboardInterrupt.
         """
@@ -334,14 +328,12 @@ class Mpc:
             *noise_forgotten(plant.scene, rng),
             *unstable_loop(plant.scene, motion, plant.substeps),
             *motion.warnings,
-            *_restless(motion, plant.substeps),
-            *loop.late_ticks(),
-            *loop.failed_ticks(),
+            *loop.without_plans(),
             *violated,
         )
         announce(logger, plant.scene.announced, loop.dt, found)
         again = {(finding.kind, finding.joint) for finding in found}
-        first = (finding for finding in loop.of_plan if (finding.kind, finding.joint) not in again)
+        first = (finding for finding in loop.plans[0].warnings if (finding.kind, finding.joint) not in again)
         return MpcRun(
             motion,
             tuple(loop.plans),
@@ -363,12 +355,10 @@ class _Loop:
         problem = controller.problem
         self.controller, self.problem, self.plant, self.rng = controller, problem, plant, rng
         self.dt = controller.period / plant.substeps
-        self.active, self.of_plan = controller._first_plan(problem)
-        if self.active.status is Status.INTERRUPTED or any(told.kind == "interrupted" for told in self.of_plan):
+        self.active, self.age = solve(problem, tolerance=controller.tolerance), 0
+        if self.active.status is Status.INTERRUPTED or any(told.kind == "interrupted" for told in self.active.warnings):
             raise KeyboardInterrupt
-        self.age = 0
-        self.q, self.v, self.before = problem.q0, problem.v0, problem.before
-        self.applied: Floats | None = problem.before
+        self.q, self.v, self.applied = problem.q0, problem.v0, problem.before
         noisy = rng is not None and plant.scene.processes > 0
         self.method = plant.integrator or usual_integrator(plant.scene, self.q, self.v, self.dt, noisy=noisy)
         self.parts: list[Trajectory] = []
@@ -380,8 +370,9 @@ class _Loop:
         """Plan from the present state; where there is no plan in time, the one before acts on."""
         begin, fresh, failure = time.perf_counter(), None, None
         t = self.problem.t0 + len(self.parts) * self.controller.period
+        before = self.applied if self.problem.remembers else None
         try:
-            fresh = self.controller.plan(t, self.q, self.v, self.active, self.age + 1, self.before)
+            fresh = self.controller.plan(t, self.q, self.v, self.active, self.age + 1, before)
         except (StepFailure, LinearizationError, NoiseFieldError) as error:
             failure = error
         except CostError as error:
@@ -395,32 +386,33 @@ class _Loop:
         self.late.append(self.seconds[-1] > self.controller.budget)
         self.failed.append(not self.late[-1] and (fresh is None or bool(np.isnan(fresh.gradient).all())))
         if self.failed[-1]:
-            self.reasons.append(fresh.reason if fresh is not None else getattr(failure, "reason", "") or str(failure))
-            if self.age + 1 >= len(self.active.gains) - self.problem.linear:
-                motion, residual = self.motion(), getattr(failure, "residual", np.nan)
-                told = f"no plan can be made from here, and the last plan is at its end; {self.reasons[-1]}"
-                advice = "Use a longer horizon, or more iterations a tick"
-                raise StepFailure(motion.steps, motion.t[-1], Failure(told, residual), motion, advice) from failure
-        if fresh is None or self.late[-1] or self.failed[-1]:
-            self.age += 1
-        else:
+            self.reasons.append(str(failure) if fresh is None else fresh.reason)
+        if fresh is not None and not (self.late[-1] or self.failed[-1]):
             self.active, self.age = fresh, 0
+            return
+        self.age += 1
+        if self.age >= len(self.active.gains) - self.problem.linear:
+            motion = self.motion()
+            why = f"it took {self.seconds[-1]:.3g} s" if self.late[-1] else self.reasons[-1]
+            told = Failure(f"no plan can be made from here in time, and the last plan is at its end; {why}", np.nan)
+            advice = "Use a longer horizon, a larger budget, or more iterations a tick"
+            raise StepFailure(motion.steps, motion.t[-1], told, motion, advice) from failure
 
     def act(self) -> Nodes:
         """Apply the present decision of the active plan over a tick; the plant's motion in it."""
         self.plans.append(self.active)
-        begun = None
-        if self.problem.linear:
+        before = self.applied
+        if self.problem.linear and self.age == 0:
             # A fresh plan begins at the measured state; one that acts on, where the line before ended.
-            begun = self.active.controls[0] if self.age == 0 or self.applied is None else self.applied
-        self.applied = _decision(self.active, self.age, self.q, self.v, self.before if begun is None else begun)
+            before = self.active.controls[0]
+        self.applied = _decision(self.active, self.age, np.concatenate([self.q, self.v]), before)
         scene, substeps = self.plant.scene, self.plant.substeps
         # Joints with kinematic inputs move on one line or cubic to their next positions over the tick.
         controls: Any = in_parts_of_steps(
             scene, self.applied[None], self.q[None], self.v[None], self.controller.period, substeps
         )
-        if begun is not None:
-            line = FirstOrderHold(np.vstack([begun, self.applied])).refined(substeps).u
+        if self.problem.linear and before is not None:
+            line = FirstOrderHold(np.vstack([before, self.applied])).refined(substeps).u
             controls = FirstOrderHold(np.vstack([line[:1], with_ends(scene, line[1:], controls)]))
         drawn = wiener_increments(scene.processes, self.dt, substeps, self.rng)
         options: dict[str, Any] = {"dt": self.dt, "steps": substeps, "controls": controls, "integrator": self.method}
@@ -436,36 +428,31 @@ class _Loop:
         nodes = Nodes(len(self.parts) * self.controller.period + part.t, part.q, part.v)
         self.parts.append(part)
         self.q, self.v = part.q[-1], part.v[-1]
-        self.before = self.applied if self.problem.remembers else None
         return nodes
 
     def motion(self) -> Trajectory:
-        """The plant's motion so far, with its warnings and that of failed ticks."""
+        """The plant's motion so far, with its warnings and those of ticks without a plan."""
         motion = chained(self.parts)
-        return motion.changed(warnings=(*beyond_limits(self.plant.scene, motion), *self.failed_ticks()))
+        return motion.changed(warnings=(*beyond_limits(self.plant.scene, motion), *self.without_plans()))
 
-    def late_ticks(self) -> tuple[Finding, ...]:
-        """A warning if more than a few plans took longer than the budget or the period."""
+    def without_plans(self) -> list[Finding]:
+        """Warnings if more than a few plans took longer than the budget or the period, or searches found no plan."""
         seconds, limit = np.array(self.seconds[1:]), min(self.controller.period, self.controller.budget)
-        slow = int((seconds > limit).sum())
-        if not slow > _FEW * len(seconds):
-            return ()
-        text = (
-            f"planning took longer than {1e3 * limit:.3g} ms in {slow} of {len(seconds)} ticks "
-            f"({1e3 * seconds.mean():.3g} ms in the mean). Use fewer steps, fewer iterations, a larger budget or a "
-            "longer period (hold=)"
-        )
-        return (Finding("late plans", text),)
-
-    def failed_ticks(self) -> tuple[Finding, ...]:
-        """A warning if searches found no plan."""
-        if not self.reasons:
-            return ()
-        text = (
-            f"in {sum(self.failed)} of {len(self.failed) - 1} ticks no plan was found and an older one acted, at t = "
-            f"{self.failed.index(True) * self.controller.period:.4g} s for the first time: {self.reasons[0]}"
-        )
-        return (Finding("failed ticks", text),)
+        slow, found = int((seconds > limit).sum()), []
+        if slow > _FEW * len(seconds):
+            text = (
+                f"planning took longer than {1e3 * limit:.3g} ms in {slow} of {len(seconds)} ticks "
+                f"({1e3 * seconds.mean():.3g} ms in the mean). Use fewer steps, fewer iterations, a larger budget or a "
+                "longer period (hold=)"
+            )
+            found.append(Finding("late plans", text))
+        if self.reasons:
+            text = (
+                f"in {sum(self.failed)} of {len(seconds)} ticks no plan was found and an older one acted, at t = "
+                f"{self.failed.index(True) * self.controller.period:.4g} s for the first time: {self.reasons[0]}"
+            )
+            found.append(Finding("failed ticks", text))
+        return found
 
     def constraints(self, motion: Trajectory) -> tuple[tuple[ConstraintReport, ...], list[Finding]]:
         """How well the plant's motion satisfied each constraint, and warnings about it and about plans."""
@@ -498,9 +485,9 @@ class _Loop:
 
 
 def _violated(plan: Solution) -> list[bool]:
-    """Whether a plan violates each of its constraints by more than a thousandth of its range."""
+    """Whether a plan violates each of its constraints by more than what few iterations may leave."""
     bounds = plan.problem.bound_constraints
-    return [told.violation > REPORTED * bound.scale for told, bound in zip(plan.constraints, bounds, strict=True)]
+    return [told.violation > _MISSED * bound.scale for told, bound in zip(plan.constraints, bounds, strict=True)]
 
 
 def _require_fit(plant: Scene, planned: Scene) -> None:
@@ -515,60 +502,17 @@ def _require_fit(plant: Scene, planned: Scene) -> None:
             raise InputError(f"the plant has other {what} than the problem: {of(plant)}, not {of(planned)}")
 
 
-def _restless(motion: Trajectory, substeps: int) -> tuple[Finding, ...]:
-    """A finding if a velocity of the plant goes up and down from tick to tick."""
-    found = None if motion.dw.any() else restlessness(motion.v[::substeps])
-    if found is None:
-        return ()
-    name, ticks = motion.joint_names[found[0]], motion.steps // substeps
-    text = (
-        f"under the controller the velocity of {name} goes up and down {found[1]} times in {ticks} ticks: "
-        "a smaller dt, or a greater weight on the controls, calms it"
-    )
-    return (Finding("restless ticks", text, name),)
-
-
-def _decision(plan: Solution, age: int, q: Floats, v: Floats, before: Floats | None) -> Floats:
-    """Control (m,) of the plan's decision ``age`` with feedback at the state (q, v), after the control ``before``.
+def _decision(plan: Solution, age: int, x: Floats, before: Floats | None) -> Floats:
+    """Control (m,) of the plan's decision ``age`` with feedback at the state x = (q, v), after the control ``before``.
 
     Where controls are linear between nodes it is the control at the end of the tick, and ``before`` that at its begin.
     """
-    policy, last, x, linear = (
-        plan.policy_on("velocity"),
-        len(plan.gains) - 1,
-        np.concatenate([q, v]),
-        plan.problem.linear,
-    )
-    beyond = age >= last if linear else age > last
-    u = _at_rest(plan, q, v) if beyond else None
-    if u is None and linear:
-        u = rest_of(plan, policy, min(age, last)).control(0, x, before)
-    elif u is None and beyond and before is not None and policy.previous is not None:
-        # The last decision is repeated, with itself as the previous control.
-        u = policy.control(last, x, before - policy.u[last] + policy.previous[last])
-    elif u is None:
-        u = policy.control(min(age, last), x, before)
+    u = plan.policy_on("velocity").control(age, x, before)
     for bound in plan.problem.bound_constraints:
         if isinstance(bound, BoundRate) and before is not None:
             most = bound.limit * bound.period
             u = np.clip(u, before - most, before + most)
     return u
-
-
-def _at_rest(plan: Solution, q: Floats, v: Floats) -> Floats | None:
-    """Control (m,) that brings the robot to rest where the plan ends; None where not every joint can be driven.
-
-    The plan's own last gains are of one step before its end. Repeated, those of steep terminal costs do not stabilize.
-    """
-    end = plan.problem.at(q0=plan.trajectory.q[-1], v0=np.zeros_like(v))
-    gains = end.holding_feedback("velocity", slower=True)
-    if gains is None:
-        return None
-    away = np.concatenate([q - end.q0, v])
-    if end.linear:
-        # A line ends a tick later, and the next begins there: without a look ahead springs would be driven.
-        away = end.coasting(end.period) @ away
-    return np.asarray(np.clip(closest_controls(end.scene, end.q0) + gains @ away, *end.control_limits))
 
 
 def _margins(problem: OptimalControlProblem, previous: Solution, known: Multipliers) -> Multipliers:

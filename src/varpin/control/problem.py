@@ -6,8 +6,7 @@ Equation (O1) of docs/mathematics.md.
 from __future__ import annotations
 
 import logging
-import re
-import zlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,7 +14,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint, BoundRate, Horizon, PlanConstraint
@@ -39,7 +37,7 @@ from varpin.signals.commands import as_moved, cubics
 from varpin.signals.policy import LinearPolicy, OpenLoop
 from varpin.simulation.choice import usual_integrator, usual_kick
 from varpin.simulation.simulate import simulate
-from varpin.simulation.spectrum import damping_matrices, rate_at_rest
+from varpin.simulation.spectrum import rate_at_rest
 from varpin.simulation.start import on_constraints, time_steps
 from varpin.support.checks import (
     JointValues,
@@ -49,7 +47,7 @@ from varpin.support.checks import (
     flag,
     joint_array,
     named_limits,
-    positive,
+    tuple_of,
     word,
 )
 from varpin.support.frozen import Frozen
@@ -57,9 +55,6 @@ from varpin.support.markup import facts, listed
 from varpin.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
-
-# A function in a description, with its address, which differs from process to process.
-_FUNCTION = re.compile(r"<(?:[^<>]|<[^<>]*>)* at 0x[0-9a-f]+>")
 
 Sampling = Literal["midpoint", "gauss", "start"]
 Shape = Literal["held", "linear"]
@@ -69,6 +64,9 @@ _STIFF = 10.0
 # Stages of the default integrator. Two match the cost's order; four resolve friction up to ten times as fast as the
 # step, for a third more time.
 STAGES = 4
+# Greatest natural frequency of the feedback of first motions, times the period of controls; from 0.1 to 0.5. Singular
+# values of the constraints that are rounding errors, relative to the largest; from 1e-12 to 1e-6.
+_FASTEST, _SINGULAR = 0.25, 1e-9
 # Longest value in a message of a difference, in characters.
 _SHORT = 60
 
@@ -87,19 +85,7 @@ class OptimalControlProblem(Frozen):
 
         cost = vp.TrackingCost(reference, 10.0) + vp.ControlCost(0.1) + vp.Terminal(2.0 * vp.TrackingCost(goal))
 
-    ============================= ================================================================
-    ``TrackingCost(q_r, weight)`` weight . (q - q_r(t))^2
-    ``VelocityCost(weight, v_r)`` weight . (v - v_r(t))^2
-    ``ControlCost(weight, u_r)``  weight . (u - u_r(t))^2; give every control some
-    ``ControlRateCost(weight)``   weight . (du/dt)^2, which keeps controls smooth
-    ``FramePositionCost``         a frame's position; also ``FrameOrientationCost``,
-                                  ``FrameVelocityCost``
-    ``CenterOfMassCost``          the robot's centre of mass
-    ``ManipulabilityCost``        keeps away from singular postures
-    ``JointLimitBarrier``         keeps joints within their limits; ``VelocityLimitBarrier``
-    ``CustomCost(function)``      a user's function of (t, q, v, u)
-    ``Terminal(cost)``            any of them but the control's, at the end instead of integrated
-    ============================= ================================================================
+    Every control needs a cost of its own, such as :class:`varpin.ControlCost`.
 
     Attributes:
         scene: The scene, its noise included.
@@ -115,9 +101,9 @@ class OptimalControlProblem(Frozen):
             ``Gauss(stages=4)``. All with ``kick="held"`` where the scene has noise.
         sampling: Where in each step running costs are sampled. ``"gauss"``, the default: at its two Gauss points, with
             a cubic motion between the nodes, of fourth order; at four points where a :class:`varpin.KinematicInput` is
-            cubic. ``"midpoint"``: at ((q + q')/2, (q' - q)/dt, u), of
-            second order; it is blind to velocities that alternate from node to node, as optimal ones often do.
-            ``"start"``: at the step's first node, a left sum as in the paper, of first order.
+            cubic. ``"midpoint"``: at ((q + q')/2, (q' - q)/dt, u), of second order; it is blind to velocities that
+            alternate from node to node, as optimal ones often do. ``"start"``: at the step's first node, a left sum as
+            in the paper, of first order.
         hold: Steps that share one control: a digital controller's period over the integrator's step.
         t0: Time at the beginning of the horizon [s], for references that are functions of time.
         control_limits: Least and greatest control (2, m) [N m or N per unit of control], infinite where there is none;
@@ -147,6 +133,7 @@ class OptimalControlProblem(Frozen):
     constraints: tuple[PlanConstraint, ...]
     running: BoundSum = field(repr=False)
     terminal: BoundSum = field(repr=False)
+    places: Floats = field(repr=False)
     rule: Floats = field(repr=False)
     rate: ControlRate | None = field(repr=False)
     controls: Shape
@@ -211,15 +198,14 @@ class OptimalControlProblem(Frozen):
                 f"sampling = {sampling!r} misses the nodes, where {what}: leave it out, for 'gauss'", "sampling"
             )
         t0, (places, rule) = finite("t0", t0), _rule(sampling, dt, cubic=cubic)
-        times = t0 + _times(places, steps, dt)
-        names = scene.robot.joint_names
+        times, names = t0 + _times(places, steps, dt), scene.robot.joint_names
         points = Points(times, dt * steps, steps, n, m, t0, names, scene.control_joints, scene.robot)
         running, terminal = bind_cost(cost, times, points)
         at, speed = joint_array("q0", q0, names), joint_array("v0", v0, names)
         if scene.constraints:
             at, speed, moved = on_constraints(scene, at, speed)
             announce(logger, scene.announced, dt, moved)
-        rate, given = control_rate(cost, m, scene.control_joints), _constraints(constraints)
+        note = "; those of the mechanism belong to varpin.Scene(constraints=)"
         values = {
             "scene": scene,
             "cost": cost,
@@ -231,20 +217,21 @@ class OptimalControlProblem(Frozen):
             "sampling": sampling,
             "hold": hold,
             "t0": t0,
-            "control_limits": _control_limits(control_limits, scene),
-            "constraints": given,
+            "control_limits": named_limits("control_limits", control_limits, scene.control_joints, m),
+            "constraints": tuple_of("constraints", constraints, PlanConstraint, note),
             "running": running,
             "terminal": terminal,
+            "places": places,
             "rule": rule,
-            "rate": rate,
+            "rate": control_rate(cost, m, scene.control_joints),
             "controls": controls,
             "between_nodes": flag("between_nodes", between_nodes),
             "integrator_by_default": integrator is None,
-            "bound_constraints": _bind_constraints(given, scene, (t0, dt, steps, hold), rate, linear=linear),
         }
-        for value in (at, speed, rule):
+        for value in (at, speed, places, rule):
             value.setflags(write=False)
         vars(self).update(values)
+        vars(self)["bound_constraints"] = self.constraints_on(dt, steps, hold)
 
     def __repr__(self) -> str:
         held = f", each control held over {self.hold}" if self.hold > 1 else ", linear controls" if self.linear else ""
@@ -287,24 +274,19 @@ class OptimalControlProblem(Frozen):
         It is given where a limit of the rate begins with a control before the horizon: lines do not jump. Of a
         kinematic input it is where the joint is.
         """
-        found = None
-        scene = self.scene
+        scene, found = self.scene, None
         if self.linear and scene.inputs:
             found = as_moved(scene, self.q0, self.v0, np.full(scene.controls, np.nan))
         for item in self.bound_constraints if self.linear else ():
             if isinstance(item, BoundRate) and item.before is not None:
-                found = np.full(self.scene.controls, np.nan) if found is None else found
+                found = np.full(scene.controls, np.nan) if found is None else found
                 found[item.limited] = np.clip(item.before, *self.control_limits)[item.limited]
         return found
 
     def begun(self, u: Floats) -> Floats:
         """Controls of decisions (R, m) whose first one is :attr:`begin` where that is given."""
         given = self.begin
-        if given is None:
-            return u
-        u = np.array(u)
-        u[0] = np.where(np.isnan(given), u[0], given)
-        return u
+        return u if given is None else np.vstack([np.where(np.isnan(given), u[0], given), u[1:]])
 
     @property
     def decisions(self) -> int:
@@ -348,14 +330,10 @@ class OptimalControlProblem(Frozen):
                 neither cost nor limit; or as for the problem itself.
         """
         if before is not None and not self.remembers:
-            raise InputError(
-                "before is the control that a ControlRateCost or a WithinControlRate begins with: give one"
-            )
+            raise InputError("before is what a ControlRateCost or a WithinControlRate begins with: give one")
         if dt is not None and steps is None and duration is None:
-            steps = round(self.duration / positive("dt", dt, "s"))
-            if abs(steps * dt - self.duration) > 1e-9 * self.duration:
-                raise InputError(f"the horizon of {self.duration:g} s is no multiple of dt = {dt:g} s")
-        elif duration is not None:
+            duration = self.duration
+        if duration is not None:
             dt, steps = time_steps(self.dt if dt is None and steps is None else dt, steps, duration)
         moved: dict[str, Any] = {"q0": q0, "v0": v0, "t0": t0}
         grid: dict[str, Any] = {"dt": dt, "steps": steps, "integrator": integrator, "sampling": sampling, "hold": hold}
@@ -391,9 +369,7 @@ class OptimalControlProblem(Frozen):
             changed["running"], changed["terminal"] = bind_cost(self.cost, times, points, (self.running, self.terminal))
         found = self.changed(**changed)
         if self.constraints and ("constraints" in changed or "t0" in changed):
-            grid = found.t0, found.dt, found.steps, found.hold
-            bound = _bind_constraints(found.constraints, scene, grid, found.rate, linear=self.linear)
-            vars(found)["bound_constraints"] = bound
+            vars(found)["bound_constraints"] = found.constraints_on(found.dt, found.steps, found.hold)
         return found
 
     def in_parts(self, parts: int) -> OptimalControlProblem:
@@ -411,6 +387,7 @@ class OptimalControlProblem(Frozen):
             steps=steps,
             hold=1 if self.linear else self.hold * parts,
             sampling="gauss",
+            places=places,
             rule=rule,
             running=running,
             terminal=terminal,
@@ -419,56 +396,66 @@ class OptimalControlProblem(Frozen):
 
     @cached_property
     def setting(self) -> dict[str, Any]:
-        """What tells the problem from others, costs aside: numbers and texts by name; noise in Python by its size."""
+        """What tells the problem from others, costs aside: numbers and texts by name; noise in Python by its size.
+
+        Constraints are their values at the start at all nodes: a function of time may have no name.
+        """
         names = ("dt", "steps", "hold", "controls", "between_nodes", "sampling", "q0", "v0", "t0", "control_limits")
         found: dict[str, Any] = {name: getattr(self, name) for name in names}
         found["joints"] = ", ".join(self.scene.robot.joint_names)
-        noise = self.scene.diffusion._asdict()
         values = {name: array for name, array in self.scene.values.items() if not name.startswith("noise.")}
         found |= {f"scene.{name}": array for name, array in values.items()}
-        found |= {f"noise.{name}": array for name, array in noise.items()}
-        return found | {"constraints": self.described_constraints, "integrator": repr(self.integrator)}
+        found |= {f"noise.{name}": array for name, array in self.scene.diffusion._asdict().items()}
+        found |= {
+            "constraints": ", ".join(item.label for item in self.constraints),
+            "integrator": repr(self.integrator),
+        }
+        q, v = (np.tile(state, (self.steps + 1, 1)) for state in (self.q0, self.v0))
+        u = np.zeros((self.steps + self.linear, self.scene.controls))
+        for i, bound in enumerate(self.bound_constraints):
+            found[f"constraints.{i}"] = np.append(bound.value(q, v, u), bound.source.margin)
+        return found
 
     def differs(self, setting: Mapping[str, Any]) -> str:
         """The first difference from a problem of another :attr:`setting` in words; empty if there is none."""
         for name in dict.fromkeys((*self.setting, *setting)):
             theirs, mine = (np.asarray(one.get(name, np.zeros(0))) for one in (setting, self.setting))
             texts = mine.dtype.kind == "U" or theirs.dtype.kind == "U"
-            if np.array_equal(theirs, mine) if texts else same(theirs, mine):
-                continue
-            short = max(len(str(theirs)), len(str(mine))) <= _SHORT
-            return f"{name} = {theirs}, not {mine}" if short else f"different {name.replace('.', ' ')}"
+            if not (np.array_equal(theirs, mine) if texts else same(theirs, mine)):
+                short = max(len(str(theirs)), len(str(mine))) <= _SHORT
+                return f"{name} = {theirs}, not {mine}" if short else f"different {name.replace('.', ' ')}"
         return ""
+
+    def mismatch(self, setting: Mapping[str, Any], trajectory: Trajectory, cost: float) -> str:
+        """Of which other problem a plan's :attr:`setting`, motion and cost are, in words; empty if of this one."""
+        if difference := self.differs(setting):
+            return f"of another problem: {difference}"
+        found = self.cost_of(trajectory)
+        close = math.isclose(found, cost, rel_tol=1e-9)
+        return "" if close else f"of a problem with another cost: {cost:.9g}, and here {found:.9g}"
 
     def constraints_on(
         self, dt: float, steps: int, hold: int, *, linear: bool | None = None
     ) -> tuple[BoundConstraint, ...]:
         """The constraints on another grid, and for controls that are ``linear`` between nodes or held."""
+        scene, before = self.scene, None if self.rate is None else self.rate.before
         lines = self.linear if linear is None else linear
-        return _bind_constraints(self.constraints, self.scene, (self.t0, dt, steps, hold), self.rate, linear=lines)
+        times = self.t0 + np.arange(steps + 1, dtype=np.float64) * dt
+        horizon = Horizon(times, scene.robot, scene.controls, hold, scene.control_joints, before, lines)
+        bound = []
+        for i, item in enumerate(self.constraints):
+            try:
+                bound.append(item.bind(horizon))
+            except InputError as error:
+                error.argument = f"constraints[{i}]"
+                raise
+        return tuple(bound)
 
     def label_of(self, constraint: PlanConstraint) -> str:
         """The name of one of the constraints in reports, with its index where several have the same name."""
         alike = [i for i, other in enumerate(self.constraints) if other.label == constraint.label]
         index = [i for i in alike if self.constraints[i] is constraint]
         return f"{constraint.label} (constraints[{index[0]}])" if len(alike) > 1 and index else constraint.label
-
-    @property
-    def described_constraints(self) -> str:
-        """A full description of the constraints, for comparison; empty without any.
-
-        Functions of time are described by their values at the nodes: their names differ from process to process.
-        """
-        times = self.t0 + self.dt * np.arange(self.steps + 1)
-        words = []
-        for constraint in self.constraints:
-            text = repr(constraint)
-            words.append(_FUNCTION.sub("function", text))
-            if words[-1] != text:
-                moving = (constraint, *getattr(constraint, "obstacles", ()))
-                shifts = [part.shifts(times) for part in moving if hasattr(part, "shifts")]
-                words.append(f"at nodes {[zlib.crc32(shift.round(12).tobytes()) for shift in shifts]}")
-        return "; ".join(words)
 
     @property
     def processes(self) -> int:
@@ -483,11 +470,6 @@ class OptimalControlProblem(Frozen):
         if fields is not None and self.integrator.variational:
             found[: self.scene.processes] = fields.control.any(axis=(0, 2)) | fields.quadratic.any(axis=0)
         return found
-
-    @cached_property
-    def at_velocities(self) -> bool:
-        """Whether sample points of :attr:`rule` depend on the velocities of nodes."""
-        return bool(self.rule[:, 2::2].any())
 
     @cached_property
     def limited(self) -> bool:
@@ -505,13 +487,10 @@ class OptimalControlProblem(Frozen):
         The feedback is M(q0) (omega^2 (q0 - q) - 2 omega v), twice as fast as the fastest natural motion at q0. Without
         feedback rounding errors alone make an upright arm fall over.
         """
-        n, m = self.scene.robot.dof, self.scene.controls
         R = self.steps if self.linear else self.decisions
+        u, reference = self.holding_controls(), np.append(self.q0, np.zeros(self.q0.size))
         on: Literal["momentum", "velocity"] = "momentum" if self.integrator.variational else "velocity"
-        feedback, u = self.holding_feedback(on), self.holding_controls()
-        gains = np.zeros((m, 2 * n)) if feedback is None else feedback
-        reference = np.append(self.q0, np.zeros(n))
-        rows = (np.tile(u, (R, 1)), np.tile(gains, (R, 1, 1)), np.tile(reference, (R, 1)))
+        rows = np.tile(u, (R, 1)), np.tile(self._holding_feedback(), (R, 1, 1)), np.tile(reference, (R, 1))
         return self.policy_of(*rows, on, before=u if self.linear else None)
 
     def policy_of(
@@ -543,50 +522,25 @@ class OptimalControlProblem(Frozen):
             linear=self.linear,
         )
 
-    def holding_feedback(self, on: Literal["momentum", "velocity"], *, slower: bool = False) -> Floats | None:
-        """Gains (m, 2n) that stabilize rest at q0, on (q, p) or (q, v): see :meth:`holding_policy`.
-
-        None where not every joint can be driven, or where controls are held too long for them. With ``slower`` they are
-        then as fast as that allows, and None only where the robot would still fall over.
-        """
-        mass, curvature, along = self._at_rest()
-        driven = along.T @ self.scene.actuation
-        inertia, bend = (along.T @ x @ along for x in (mass, curvature))
-        squares = np.linalg.eigvals(np.linalg.solve(inertia, bend))
-        omega = 2.0 * float(np.sqrt(np.abs(squares).max(initial=0.0))) + 1.0 / self.duration
-        fastest = 0.25 / (self.dt * self.hold)
-        if slower:
-            omega = min(omega, fastest)
-        falls = float(squares.real.max(initial=0.0)) >= omega**2
-        if np.linalg.matrix_rank(driven) < len(driven) or falls or omega > fastest:
-            return None
-        in_v = np.eye(len(mass)) if on == "momentum" else mass
-        wanted = np.hstack([omega**2 * mass, 2.0 * omega * in_v])
-        gains: Floats = -np.linalg.pinv(driven) @ (along.T @ wanted)
-        return gains
-
-    def coasting(self, time: float) -> Floats:
-        """The flow (2n, 2n) in (q, v) over a time [s] of small motions about rest at q0, while controls stay."""
-        scene, n = self.scene, self.scene.robot.dof
-        mass, curvature, along = self._at_rest()
-        forces = (scene.actuation @ self.holding_controls())[None]
-        (damping,) = damping_matrices(scene, self.q0[None], np.zeros((1, n)), forces)
-        pull = np.hstack([curvature, -damping])
-        rates = np.eye(2 * n, k=n)
-        rates[n:] = along @ np.linalg.solve(along.T @ mass @ along, along.T @ pull)
-        found: Floats = expm(time * rates)
-        return found
-
-    def _at_rest(self) -> tuple[Floats, Floats, Floats]:
-        """M and L_qq less that of the constraint forces (n, n), at rest at q0, and a basis of the motions (n, t)."""
+    def _holding_feedback(self) -> Floats:
+        """Gains (m, 2n) of :meth:`holding_policy`; zero where joints are not driven or controls are held too long."""
         scene, q = self.scene, self.q0
-        jet, basis = lagrangian_jet(scene, q, np.zeros(q.size)), tangent_basis(scene, q)
-        if not scene.constraints:
-            return jet.Lvv, jet.Lqq, basis
-        (C,) = scene.core.constraints(q[None])[2]
-        left = scene.actuation @ self.holding_controls() - scene.static_pull(q)
-        y = np.linalg.lstsq(C.T, left, rcond=1e-9)[0]
-        return jet.Lvv, jet.Lqq - scene.core.constraint_curvature(q, y, np.zeros(q.size))[0], basis
+        jet, along = lagrangian_jet(scene, q, np.zeros(q.size)), tangent_basis(scene, q)
+        mass, curvature, driven = jet.Lvv, jet.Lqq, along.T @ scene.actuation
+        if scene.constraints:
+            # Constraint forces change with q, too.
+            (C,) = scene.core.constraints(q[None])[2]
+            left = scene.actuation @ self.holding_controls() - scene.static_pull(q)
+            y = np.linalg.lstsq(C.T, left, rcond=_SINGULAR)[0]
+            curvature = curvature - scene.core.constraint_curvature(q, y, np.zeros(q.size))[0]
+        squares = np.linalg.eigvals(np.linalg.solve(along.T @ mass @ along, along.T @ curvature @ along))
+        omega = 2.0 * float(np.sqrt(np.abs(squares).max(initial=0.0))) + 1.0 / self.duration
+        if np.linalg.matrix_rank(driven) < len(driven) or omega * self.period > _FASTEST:
+            return np.zeros((scene.controls, 2 * q.size))
+        on_speeds = np.eye(q.size) if self.integrator.variational else mass
+        wanted = along.T @ np.hstack([omega**2 * mass, 2.0 * omega * on_speeds])
+        gains: Floats = -np.linalg.pinv(driven) @ wanted
+        return gains
 
     def decided(self, trajectory: Trajectory) -> Floats:
         """The controls (R, m) of a motion on the problem's grid, one row per decision."""
@@ -648,18 +602,9 @@ class OptimalControlProblem(Frozen):
         causes no rounding error.
         """
         q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
-        return self.shares_along(q, v, u, self.running.compiled.values(*self.samples(q, v, u)))
-
-    def shares_along(self, q: Floats, v: Floats, u: Floats, compiled: Floats) -> Floats:
-        """:meth:`shares` of a motion, q and v (N + 1, n) and u (N, m), or (N + 1, m) at the nodes.
-
-        ``compiled`` are values of the running terms that the core evaluates, at all samples (N s, terms).
-        """
-        weight = self.dt * self.rule[0, 0]
-        found = [weight * compiled.ravel()]
-        if self.running.others:
-            at = self.samples(q, v, u)
-            found += [weight * (factor * part.value(*at)) for factor, part in self.running.others]
+        at, weight = self.samples(q, v, u), self.dt * self.rule[0, 0]
+        found = [weight * self.running.compiled(*at).ravel()]
+        found += [weight * (factor * part.value(*at)) for factor, part in self.running.others]
         found += [values.ravel() for values in self.terminal.shares(q[-1:], v[-1:], np.zeros((1, u.shape[1])))]
         if self.rate is not None:
             found.append(self.rate.shares(u[:: self.hold], self.period))
@@ -710,13 +655,6 @@ class OptimalControlProblem(Frozen):
         """Expansion of the running costs along a motion, at their samples, in (q, v, u)."""
         return self.running.expand(*self.samples(trajectory.q, trajectory.v, self.control_rows(trajectory)))
 
-    @cached_property
-    def places(self) -> Floats:
-        """Sample points of running costs in a step of unit length (s,)."""
-        places = _rule(self.sampling, self.dt, cubic=max(self.scene.rates, default=-1) >= 0)[0]
-        places.setflags(write=False)
-        return places
-
     def expand_terminal(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the terminal costs at the end of a motion, in (q, v, u)."""
         return self.terminal.expand(trajectory.q[-1:], trajectory.v[-1:], np.zeros((1, self.scene.controls)))
@@ -725,13 +663,9 @@ class OptimalControlProblem(Frozen):
 def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
     """The integrator of a problem that gives none: Gauss's, with three stages in calm steps, or the L-stable one.
 
-    Three stages where no swing or damper of the start is fast in a step, so that :func:`varpin.simulate` takes two: in
-    reaches of four arms their plans lost at most 4e-5 more than those of four, in three quarters of the time.
-
     A mode z times as fast as the step decays by the factor 1 - 40 / z in a step of Gauss(4), and rings after each jump
-    of a held control. In reaches of damped arms, plans of the L-stable method lose less from z = 10 on, and those of
-    the default up to 5. Radau's methods do not support constraints of the scene. Noise is held over the step: in the
-    long steps of plans an impulse costs two to five times as much.
+    of a held control. Radau's methods do not support constraints of the scene. Noise is held over the step: in the long
+    steps of plans an impulse costs two to five times as much.
     """
     kick = usual_kick(scene)
     if not scene.constraints and dt * rate_at_rest(scene, q0) > _STIFF:
@@ -740,52 +674,6 @@ def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
         return Gauss(STAGES, kick=kick)
     usual = usual_integrator(scene, q0, np.zeros_like(q0), dt, noisy=False)
     return Gauss(3 if usual == Gauss(2, kick=kick) else STAGES, kick=kick)
-
-
-def _control_limits(given: tuple[JointValues, JointValues] | None, scene: Scene) -> Floats:
-    if isinstance(given, str):
-        raise InputError(
-            "control_limits must be a pair (lower, upper), for a robot with every joint driven "
-            f"(-robot.effort_limit, robot.effort_limit); got {given!r}"
-        )
-    return named_limits("control_limits", given, scene.control_joints, scene.controls)
-
-
-def _constraints(given: Sequence[PlanConstraint]) -> tuple[PlanConstraint, ...]:
-    if not isinstance(given, list | tuple):
-        raise InputError(f"constraints must be a list of plan constraints, got {type(given).__name__}")
-    for item in given:
-        if not isinstance(item, PlanConstraint):
-            raise InputError(
-                "constraints of a plan are for example varpin.WithinJointLimits(robot); those of the mechanism belong "
-                f"to varpin.Scene(constraints=); got {type(item).__name__}"
-            )
-    return tuple(given)
-
-
-def _bind_constraints(
-    constraints: tuple[PlanConstraint, ...],
-    scene: Scene,
-    grid: tuple[float, float, int, int],
-    rate: ControlRate | None,
-    *,
-    linear: bool,
-) -> tuple[BoundConstraint, ...]:
-    """Constraints on a grid: of t0, dt, steps and hold."""
-    if not constraints:
-        return ()
-    t0, dt, steps, hold = grid
-    times = t0 + np.arange(steps + 1, dtype=np.float64) * dt
-    before = None if rate is None else rate.before
-    horizon = Horizon(times, scene.robot, scene.controls, hold, scene.control_joints, before, linear)
-    bound = []
-    for i, item in enumerate(constraints):
-        try:
-            bound.append(item.bind(horizon))
-        except InputError as error:
-            error.argument = f"constraints[{i}]"
-            raise
-    return tuple(bound)
 
 
 def _rule(sampling: str, dt: float, *, cubic: bool) -> tuple[Floats, Floats]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -13,7 +13,6 @@ from typing import Literal
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.costs import JointLimitBarrier, VelocityLimitBarrier
 from varpin.control.history import Iteration, Refinement, SearchState, Status
 from varpin.control.monte_carlo import MonteCarlo, monte_carlo
 from varpin.control.multipliers import ConstraintReport, Multipliers, reports
@@ -25,38 +24,11 @@ from varpin.control.verification import Verification, verify
 from varpin.errors import InputError
 from varpin.finding import Finding
 from varpin.linearization import velocity_at_nodes
-from varpin.model import joint_unit
 from varpin.signals.policy import LinearPolicy
 from varpin.support.checks import JointValues, count, positive, word
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, folded, listed, table, warning_count
 from varpin.trajectory import Trajectory
-
-
-@dataclass(frozen=True, eq=False)
-class Violations:
-    """Largest violation of limits by a motion's nodes for each joint or control; zero where limits hold.
-
-    Attributes:
-        position: Beyond the limits of the robot's joints, or of a narrower :class:`varpin.JointLimitBarrier` in the
-            cost (n,) [rad or m].
-        velocity: Likewise (n,) [rad/s or m/s].
-        control: Beyond the problem's control limits (m,).
-    """
-
-    position: Floats
-    velocity: Floats
-    control: Floats
-
-    @property
-    def any(self) -> bool:
-        """Whether any limit is violated."""
-        return bool(any(part.any() for part in (self.position, self.velocity, self.control)))
-
-    def __repr__(self) -> str:
-        parts = {"position": self.position, "velocity": self.velocity, "control": self.control}
-        beyond = [f"{name} by up to {part.max():.3g}" for name, part in parts.items() if part.any()]
-        return f"Violations({', '.join(beyond) or 'none'})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +72,7 @@ class Solution(Frozen):
         history: One entry for each iteration.
         search: State of the search, from which :func:`varpin.solve` continues with ``resume``.
         warnings: Warnings about the plan, each with what to change: its cost is higher when its steps are taken in
-            quarters, its velocities alternate or oscillate, its energy balance does not close, the requested true cost
-            is not met.
+            quarters, it passes limits, the requested true cost is not met.
         refinement: The steps tried where ``true_cost`` was given; else None.
         multipliers: Multipliers of the problem's constraints, with their margins; None without constraints.
     """
@@ -142,19 +113,6 @@ class Solution(Frozen):
         """Number of iterations with a line search."""
         return sum(item.rollouts > 0 for item in self.history)
 
-    @property
-    def violations(self) -> Violations:
-        """Violations of the joint limits, in the cost or not, and of the control limits."""
-        robot, motion, speed = self.problem.scene.robot, self.trajectory, self.problem.scene.robot.velocity_limit
-        terms = self.problem.cost.terms
-        joints = (term.limits for term in terms if isinstance(term, JointLimitBarrier))
-        speeds = (term.limits for term in terms if isinstance(term, VelocityLimitBarrier))
-        return Violations(
-            position=_beyond(motion.q, [robot.position_limits, *joints]),
-            velocity=_beyond(motion.v, [(-speed, speed), *speeds]),
-            control=_beyond(self.problem.control_rows(motion), [self.problem.control_limits]),
-        )
-
     @cached_property
     def constraints(self) -> tuple[ConstraintReport, ...]:
         """How well the motion satisfies each of the problem's constraints, in their order."""
@@ -182,28 +140,21 @@ class Solution(Frozen):
         )
 
     def _repr_html_(self) -> str:
-        problem, beyond, robot = self.problem, self.violations, self.problem.scene.robot
+        problem = self.problem
+        most = np.abs(problem.control_rows(self.trajectory)).max(axis=0, initial=0.0)
         rows: list[tuple[str, object]] = [
             ("status", self.status.value),
             ("why", self.reason),
             ("cost", f"{self.cost:.6g}" + (f", and {self.noise_cost:.4g} by noise" if self.noise_cost else "")),
             ("iterations", f"{self.iterations} in {sum(item.seconds for item in self.history):.3g} s"),
             ("horizon", f"{problem.steps} steps of {problem.dt:g} s, {problem.integrator}"),
+            *(("constraint", report) for report in self.constraints),
+            *(("warning", warning) for warning in self.warnings),
+            ("largest controls", listed(f"{value:.4g}" for value in most)),
         ]
-        for what, part in (("position", beyond.position), ("velocity", beyond.velocity)):
-            over = [f"{name} {value:.3g}" for name, value in zip(robot.joint_names, part, strict=True) if value]
-            if over:
-                unit = joint_unit(robot, speed=what == "velocity")
-                rows.append((f"{what} beyond limits [{unit}]", listed(over)))
-        if beyond.control.any():
-            rows.append(("controls beyond limits", f"{beyond.control.max():.3g} at most"))
-        rows += [("constraint", report) for report in self.constraints]
-        rows += [("warning", warning) for warning in self.warnings]
-        most = np.abs(problem.control_rows(self.trajectory)).max(axis=0, initial=0.0)
-        rows.append(("largest controls", listed(f"{value:.4g}" for value in most)))
         history = [str(item).rstrip(" *").split() for item in self.history]
         columns = Iteration.HEADER.replace("noise cost", "noise").split()
-        return facts(f"Plan for {robot.name}", rows, folded("iterations", table(columns, history)))
+        return facts(f"Plan for {problem.scene.robot.name}", rows, folded("iterations", table(columns, history)))
 
     def table(self) -> str:
         """The iterations, one row each, and how and why they ended; :class:`Solution` explains the columns."""
@@ -248,7 +199,24 @@ class Solution(Frozen):
         """
         if not 0 <= count("decisions", decisions) < len(self.gains):
             raise InputError(f"decisions must be from 0 to {len(self.gains) - 1}, got {decisions}")
-        return rest_of(self, self.policy, decisions, before)
+        policy, motion, N = self.policy, self.trajectory, len(self.policy.u)
+        later = np.arange(N) + decisions
+        rows = np.minimum(later, N - 1)
+        u, reference, expected = policy.u[rows], policy.reference[rows], policy.u[:0]
+        if self.problem.linear:
+            second = motion.p if policy.on == "momentum" else motion.v
+            reference = np.where((later >= N)[:, None], np.append(motion.q[-1], second[-1]), reference)
+            rows = np.where(later >= N, N // 2, rows)
+            expected = self.controls[decisions, None]
+            before = expected[0] if before is None else before
+        elif policy.previous is not None:
+            expected = policy.previous[rows[:1]]
+        previous_gains = None if policy.previous_gains is None else policy.previous_gains[rows]
+        # A repeated control has itself as its previous one.
+        previous = None if previous_gains is None else np.vstack([expected, u[:-1]])
+        on: Literal["momentum", "velocity"] = "velocity" if policy.on == "velocity" else "momentum"
+        given = u, policy.gains[rows], reference, on
+        return self.problem.policy_of(*given, before=before, previous_gains=previous_gains, previous=previous)
 
     def policy_on(self, x: Literal["momentum", "velocity"], substeps: int = 1) -> LinearPolicy:
         """The policy on (q, p) or on (q, v), each control held over ``substeps`` times as many steps.
@@ -306,7 +274,6 @@ class Solution(Frozen):
             self.trajectory,
             self.cost,
             self.policy_on,
-            status=self.status,
             tolerance=tolerance,
             max_substeps=max_substeps,
             progress=progress,
@@ -346,63 +313,15 @@ class Solution(Frozen):
         policy, gains = self.policy, Feedback(self.gains, self.previous_gains)
         if not feedback:
             policy, gains = policy.without_feedback(), Feedback(np.zeros(self.gains.shape), None)
+        steps, known = Steps(self.problem, self.trajectory), np.isfinite(self.noise_cost)
         return monte_carlo(
             self.problem,
             policy,
             self.expected_cost,
             paths,
             rng,
-            within=left_within_steps(Steps(self.problem, self.trajectory), gains)
-            if np.isfinite(self.noise_cost)
-            else 0.0,
+            within=left_within_steps(steps, gains) if known else 0.0,
             workers=workers,
             executor=executor,
             progress=progress,
         )
-
-
-def _beyond(y: Floats, limits: Sequence[tuple[Floats, Floats] | Floats]) -> Floats:
-    """Largest violation of any of the limits by each column of y (N, k)."""
-    excess = [np.maximum(y - upper, lower - y).max(axis=0) for lower, upper in limits]
-    most: Floats = np.maximum(0.0, np.max(excess, axis=0))
-    return most
-
-
-def rest_of(
-    plan: Solution,
-    policy: LinearPolicy,
-    decisions: int,
-    before: JointValues | None = None,
-    *,
-    means: Floats | None = None,
-) -> LinearPolicy:
-    """:meth:`Solution.shifted` of the plan's ``policy`` on (q, p) or (q, v).
-
-    With ``means`` (m,) lines beyond the plan's end have these mean controls, as far as limits allow, and no feedback.
-    """
-    N = len(policy.u)
-    later = np.arange(N) + decisions
-    rows, expected = np.minimum(later, N - 1), policy.u[:0]
-    u, reference = policy.u[rows], policy.reference[rows]
-    if plan.problem.linear:
-        beyond, motion = later > N - 1, plan.trajectory
-        second = motion.p if policy.on == "momentum" else motion.v
-        rows = np.where(beyond, N // 2, rows)
-        reference = np.where(beyond[:, None], np.append(motion.q[-1], second[-1]), reference)
-        expected = plan.controls[decisions, None]
-        before = expected[0] if before is None else before
-    elif policy.previous is not None:
-        expected = policy.previous[rows[:1]]
-    gains = policy.gains[rows]
-    previous_gains = None if policy.previous_gains is None else policy.previous_gains[rows]
-    if plan.problem.linear and means is not None:
-        for k in np.flatnonzero(beyond):
-            u[k] = np.clip(2.0 * means - (u[k - 1] if k > 0 else expected[0]), *policy.limits)
-        gains[beyond] = 0.0
-        if previous_gains is not None:
-            previous_gains[beyond] = 0.0
-    # A repeated control has itself as its previous one.
-    previous = None if previous_gains is None else np.vstack([expected, u[:-1]])
-    on: Literal["momentum", "velocity"] = "velocity" if policy.on == "velocity" else "momentum"
-    given = u, gains, reference, on
-    return plan.problem.policy_of(*given, before=before, previous_gains=previous_gains, previous=previous)

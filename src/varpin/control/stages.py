@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from varpin.arrays import Floats, Integers, Mask
-from varpin.control.constraints import BoundBetween, BoundConstraint, BoundOnCubics, BoundRate
+from varpin.control.between_nodes import BoundBetween, BoundOnCubics
+from varpin.control.constraints import BoundConstraint, BoundRate
 from varpin.control.costs import CostError, Expansion
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.samples import after_impulse, at_samples, beyond_samples
@@ -48,19 +49,10 @@ class Feedback:
 
 
 class Stake(NamedTuple):
-    """The cost at stake along a motion, without constants and noise, (O9).
+    """The cost at stake along a motion, without constants and noise, (O9)."""
 
-    For squared distances that the motion can change it is about their value.
-
-    Attributes:
-        free: Decrease of the cost's quadratic models along the motion if each state and control were free; infinite
-            where a model has no minimum, zero where the cost is least.
-        moved: The same, with each model's decrease bounded by its change over the motion's displacement, so that
-            unreachable states do not count. Tolerances are relative to it.
-    """
-
-    free: float
-    moved: float
+    free: float  # decrease of the quadratic models if all were free; infinite without a minimum, zero at the least cost
+    moved: float  # each bounded by its change over the motion's displacement: tolerances are relative to it
 
 
 def _stakes(model: Expansion, displacement: Floats) -> tuple[float, float]:
@@ -304,12 +296,7 @@ class Steps:
         return np.concatenate([np.arange(Z - m), self.states + np.arange(m)])
 
     def recursion(self, curvature: Floats | None, fixed: Mask | None) -> Recursion:
-        """The steps for the recursion.
-
-        Args:
-            curvature: Second derivatives (N, Z, Z) of the steps in the cost to go, where they count.
-            fixed: Which controls (R, m) stay as they are.
-        """
+        """The steps for the recursion, with second derivatives (N, Z, Z), and controls (R, m) that stay ``fixed``."""
         found, kept = self._wide, self._places
         if curvature is not None:
             hessian = found.hessian.copy()
@@ -350,21 +337,13 @@ class Steps:
 
 
 class Layout(NamedTuple):
-    """Where the variables of a problem are: z = (u_0, x_1, ..., x_hold, u_1, ...), and at the end a linear control.
+    """Where the variables of a problem are: z = (u_0, x_1, ..., x_hold, u_1, ...), and at the end a linear control."""
 
-    Attributes:
-        states: 2n.
-        controls: m.
-        stages: N, the number of steps.
-        hold: Steps that share a control.
-        linear: Whether there is a control at the end.
-    """
-
-    states: int
-    controls: int
-    stages: int
-    hold: int
-    linear: bool
+    states: int  # 2n
+    controls: int  # m
+    stages: int  # N, the number of steps
+    hold: int  # steps that share a control
+    linear: bool  # whether there is a control at the end
 
     @classmethod
     def of(cls, problem: OptimalControlProblem) -> Layout:
@@ -398,14 +377,10 @@ class Layout(NamedTuple):
         return np.concatenate([self.state(k), *map(self.control, ends)], axis=1)
 
     def decisions(self, feedback: Floats, previous: Floats | None) -> tuple[Integers, Floats]:
-        """The changes of controls beside feedback (R, m): u - K x - G w, with w the previous control.
+        """The changes of controls beside feedback, u - K x - G w: indices (R, Z) and derivatives (R, m, Z).
 
-        Returns the indices (R, Z) of the variables and the derivatives (R, m, Z). A control that is linear reacts to
-        the state where its line begins.
-
-        Args:
-            feedback: K (R, m, 2n).
-            previous: G (R, m, m), or None.
+        K (R, m, 2n) is on the state where a held control, or the line to a linear one, begins, G (R, m, m) on the
+        previous control w.
         """
         R, m, _ = feedback.shape
         r = np.arange(R)
@@ -416,11 +391,6 @@ class Layout(NamedTuple):
     def controls_of(self, z: Floats) -> Floats:
         """The changes of the controls (R, m) in z."""
         return z[self.control(np.arange(self.stages // self.hold + self.linear))]
-
-    def states_of(self, z: Floats) -> Floats:
-        """The changes (N + 1, 2n) of the states in z."""
-        at = self.state(np.arange(self.stages + 1))
-        return np.where(at >= 0, z[at], 0.0)
 
     def joined(self, states: Floats, controls: Floats) -> Floats:
         """The variables of changes of the states (N + 1, 2n) and of the controls (R, m)."""
@@ -449,17 +419,11 @@ class Rows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Stages(Frozen):
-    """The expansions along a motion, the matrices of (O10).
-
-    Attributes:
-        steps: The steps.
-        layout: Where the variables are.
-        costs: The costs of the steps, of control changes and of the end.
-    """
+    """The expansions along a motion, the matrices of (O10)."""
 
     steps: Steps
     layout: Layout
-    costs: tuple[Cost, ...]
+    costs: tuple[Cost, ...]  # of the steps, of the end and of control changes
 
     @property
     def J(self) -> Floats:
@@ -468,14 +432,7 @@ class Stages(Frozen):
 
     @classmethod
     def along(cls, steps: Steps, spread: Floats | None = None, curvature: Floats | None = None) -> Stages:
-        """The stages of a motion.
-
-        Args:
-            steps: The steps.
-            spread: Hessians (N, 2n, 2n) of the cost to go in the state after each step, of which noise costs the half
-                of g' S g; none without noise.
-            curvature: Second derivatives (N, Z, Z) of the steps in the cost to go, where they count.
-        """
+        """The stages of a motion, with what noise costs by Hessians S (N, 2n, 2n), and second derivatives (N, Z, Z)."""
         layout, (gradient, hessian) = Layout.of(steps.problem), steps.costs
         if spread is not None:
             gradient, hessian = (a + b for a, b in zip((gradient, hessian), steps.of_noise(spread), strict=True))
@@ -504,23 +461,17 @@ class Stages(Frozen):
             at = np.stack([layout.control(bound.places - 1)[:, columns], layout.control(bound.places)[:, columns]], 2)
             pair = np.broadcast_to(np.array([-1.0, 1.0]) / bound.period, at.shape)
             return np.concatenate([at, at], axis=1).reshape(-1, 2), np.concatenate([pair, -pair], 1).reshape(-1, 2)
-        if isinstance(bound, BoundOnCubics):
-            parts = bound.by_nodes(bound.jacobian(motion.q, motion.v))
-            nodes = bound.places - 1, bound.places
-            found = [self._at_nodes(k, part, None) for k, part in zip(nodes, parts, strict=True)]
-            return np.concatenate([at for at, _ in found], axis=1), np.concatenate([J for _, J in found], axis=1)
-        slopes = bound.slopes(motion.q, motion.v, self.steps.problem.control_rows(motion))
-        controls = slopes.by_controls if isinstance(bound, BoundBetween) else None
-        return self._at_nodes(slopes.nodes, slopes.by_state, controls)
-
-    def _at_nodes(self, nodes: Integers, by_state: Floats, by_controls: Floats | None) -> tuple[Integers, Floats]:
-        """Indices and derivatives of rows, each (P, Z), from those (K, rows, 2n) in (q, v) of nodes and of controls."""
-        of_x, layout = by_state @ self.steps.slopes[nodes], self.layout
-        if by_controls is None:
-            at, J = layout.state(nodes), of_x
+        if isinstance(bound, BoundBetween):
+            J = bound.slopes(motion.q, motion.v, self.steps.problem.control_rows(motion))
+            x, at = layout.states, layout.in_stage(bound.begins)
+            J = np.concatenate([J[:, :, :x] @ self.steps.slopes[bound.begins], J[:, :, x:]], axis=2)
         else:
-            at, J = layout.in_stage(nodes), np.concatenate([of_x, by_controls], axis=2)
-        return np.repeat(at, J.shape[1], axis=0), J.reshape(-1, J.shape[2])
+            nodes, slopes = [bound.places], [bound.jacobian(motion.q, motion.v)]
+            if isinstance(bound, BoundOnCubics):
+                nodes, slopes = [bound.places - 1, bound.places], bound.by_nodes(slopes[0])
+            at = np.concatenate([layout.state(k) for k in nodes], axis=1)
+            J = np.concatenate([part @ self.steps.slopes[k] for k, part in zip(nodes, slopes, strict=True)], axis=2)
+        return np.repeat(at, len(bound.rows), axis=0), J.reshape(-1, J.shape[2])
 
     def change(self, z: Floats) -> tuple[float, float]:
         """The slope of the cost along z, and its change at z by the quadratic model."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -11,10 +11,10 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
-from varpin.control.history import Status
 from varpin.control.problem import OptimalControlProblem
 from varpin.core.arrays import Commands
 from varpin.integrators import Gauss, Integrator, Radau, RungeKutta4
+from varpin.mechanics.scene import quiet
 from varpin.signals.commands import open_line, open_loop
 from varpin.signals.policy import LinearPolicy
 from varpin.simulation.record import rollout
@@ -37,10 +37,6 @@ _READING = (
     "where feedback loses less than a percent, the plan holds; where it loses more, dt is too coarse (controls alone "
     "also lose much where a motion is unstable)"
 )
-# A loss is far above a wish from this multiple of it on.
-_FAR = 2.0
-# Least number of parts of a step in which the constraints of a plan with a wished true cost are looked at.
-_LOOKS = 8
 
 
 @dataclass(frozen=True)
@@ -87,7 +83,6 @@ class Verification:
         accuracy: Relative change over the last doubling of the substeps, of the cost that changed more. Infinite where
             no cost could be compared: all motions diverge, or they diverged with fewer substeps, or ``max_substeps``
             allowed no doubling.
-        status: How the search for the plan ended.
         integrator: The accurate integrator: ``Radau(stages=3)`` where dampers, friction or servos are much faster than
             the plan's step.
         constraints: Violations of the problem's constraints on the continuous system, without margins, at the nodes of
@@ -102,7 +97,6 @@ class Verification:
     defect: float
     substeps: int
     accuracy: float
-    status: Status = Status.CONVERGED
     integrator: str = str(_USUAL)
     constraints: tuple[ViolationOnRobot, ...] = ()
 
@@ -117,12 +111,7 @@ class Verification:
     @property
     def told(self) -> bool:
         """Whether the costs are known to a percent; if not, nothing can be concluded about the plan."""
-        return self._diverges or self.accuracy <= _UNKNOWN
-
-    @property
-    def _diverges(self) -> bool:
-        """Whether the motion diverges under the controls alone and with feedback."""
-        return not np.isfinite([self.open_loop_cost, self.closed_loop_cost]).any()
+        return self.accuracy <= _UNKNOWN or self._diverges
 
     @property
     def open_loop_loss(self) -> float:
@@ -135,7 +124,15 @@ class Verification:
         return excess(self.closed_loop_cost, self.planned_cost)
 
     @property
-    def _why_unknown(self) -> str:
+    def _diverges(self) -> bool:
+        """Whether the motion diverges under the controls alone and with feedback."""
+        return not np.isfinite([self.open_loop_cost, self.closed_loop_cost]).any()
+
+    @property
+    def _reading(self) -> str:
+        """How to read the costs, or why they say nothing."""
+        if self.told:
+            return f"how to read it: {_READING}"
         how = "were compared with no others"
         if np.isfinite(self.accuracy):
             how = f"still change by {percent(self.accuracy)}, as something is too fast"
@@ -144,44 +141,35 @@ class Verification:
             f"plan's {how}: give max_substeps of {2 * self.substeps} or more"
         )
 
-    @property
-    def _rows(self) -> list[tuple[str, float, str, str]]:
-        return [
-            ("planned", self.planned_cost, "", ""),
-            ("controls alone", self.open_loop_cost, percent(self.open_loop_loss), f"{self.open_loop_gap:.2e}"),
-            ("with feedback", self.closed_loop_cost, percent(self.closed_loop_loss), f"{self.closed_loop_gap:.2e}"),
-        ]
+    def _rows(self) -> list[tuple[str, str, str, str]]:
+        """The costs, losses and gaps of the plan and of both motions, by their names."""
+        rows = [("planned", f"{self.planned_cost:.6e}", "", "")]
+        opened = ("controls alone", self.open_loop_cost, self.open_loop_loss, self.open_loop_gap)
+        closed = ("with feedback", self.closed_loop_cost, self.closed_loop_loss, self.closed_loop_gap)
+        for name, cost, loss, gap in (opened, closed):
+            known = np.isfinite(cost)
+            rows.append((name, f"{cost:.6e}", percent(loss), f"{gap:.2e}") if known else (name, "runs away", "", ""))
+        return rows
 
-    def _repr_html_(self) -> str:
-        rows = [row if np.isfinite(row[1]) else (row[0], "runs away", "", "") for row in self._rows]
-        head = ("", "cost", "loss", "end off by [rad or m]")
-        facts_ = [
-            ("how to read it", _READING if self.told else self._why_unknown),
-            ("a step is off by", f"{self.defect:.2e} rad or m"),
-            *(("constraint", report) for report in self.constraints),
-            *([] if self.status.converged else [("the plan is unfinished", self.status.value)]),
-        ]
-        return facts("Verification on the continuous system", facts_, table(head, rows))
-
-    def __str__(self) -> str:
-        lines = [f"{'':16}{'cost':>14}{'loss':>12}  end off by [rad or m]"]
-        for name, cost, loss, gap in self._rows:
-            values = (f"{cost:14.6e}{loss:>12}  {gap}" if np.isfinite(cost) else f"{'runs away':>14}").rstrip()
-            lines.append(f"{name:16}{values}")
+    def _notes(self) -> list[str]:
+        """What is below the table."""
+        good = "how good the costs are is not known"
         if np.isfinite(self.accuracy):
             good = f"costs are good to {self.accuracy:.0e} of themselves"
-        else:
-            good = "all motions run away" if self._diverges else "how good the costs are is not known"
-        return "\n".join(
-            [
-                *lines,
-                f"a step is off by {self.defect:.2e} rad or m at most; {good} "
-                f"({self.substeps} substeps a step, {self.integrator})",
-                f"how to read it: {_READING}" if self.told else self._why_unknown,
-                *map(str, self.constraints),
-                *([] if self.status.converged else [f"the plan is unfinished, {self.status.value}"]),
-            ]
-        )
+        elif self._diverges:
+            good = "all motions run away"
+        off = f"a step is off by {self.defect:.2e} rad or m at most; {good} ({self.substeps} substeps a step, "
+        return [f"{off}{self.integrator})", self._reading, *map(str, self.constraints)]
+
+    def _repr_html_(self) -> str:
+        head = ("", "cost", "loss", "end off by [rad or m]")
+        notes = [("", note) for note in self._notes()]
+        return facts("Verification on the continuous system", notes, table(head, self._rows()))
+
+    def __str__(self) -> str:
+        rows = [("", "cost", "loss", "end off by [rad or m]"), *self._rows()]
+        lines = (f"{name:16}{cost:>14}{loss:>12}  {gap}".rstrip() for name, cost, loss, gap in rows)
+        return "\n".join([*lines, *self._notes()])
 
 
 def excess(cost: float, base: float) -> float:
@@ -204,19 +192,13 @@ def verify(
     planned_cost: float,
     policy: Policy,
     *,
-    status: Status,
     tolerance: float,
     max_substeps: int,
     progress: Callable[[int, int], None] | None,
 ) -> Verification:
-    """Compare a plan, and its policy on (q, p) or (q, v), with accurate integrations.
-
-    The substeps double until the relative change of both costs is at most ``tolerance``. Where the explicit method does
-    not reach that because of fast dampers or dry friction, the L-stable one repeats the comparison.
-    """
-    found = _on_robot(problem, plan, policy, tolerance=tolerance, max_substeps=max_substeps, progress=progress)
-    whole = _outside(problem, problem, plan, 1)
-    violations = zip(problem.bound_constraints, whole, found.opened.outside, found.closed.outside, strict=True)
+    """Compare a plan, and its policy on (q, p) or (q, v), with accurate integrations: see :func:`on_robot`."""
+    found = on_robot(problem, plan, policy, tolerance=tolerance, max_substeps=max_substeps, progress=progress)
+    both = zip(_outside(problem, problem, plan), found.opened.outside, found.closed.outside, strict=True)
     verified = Verification(
         planned_cost=planned_cost,
         open_loop_cost=found.opened.cost,
@@ -226,24 +208,31 @@ def verify(
         defect=_defect(problem, plan, found.substeps, found.integrator),
         substeps=found.substeps,
         accuracy=found.accuracy,
-        status=status,
         integrator=str(found.integrator),
         constraints=tuple(
-            ViolationOnRobot(problem.label_of(bound.source), bound.unit, own.worst, alone.worst, fed.worst, fed.where)
-            for bound, own, alone, fed in violations
+            ViolationOnRobot(
+                problem.label_of(own.bound.source), own.bound.unit, own.worst, alone.worst, fed.worst, fed.where
+            )
+            for own, alone, fed in both
         ),
     )
     if not verified.told:
-        logger.warning("%s", verified._why_unknown)
+        logger.warning("%s", verified._reading)
     return verified
 
 
 class Outside(NamedTuple):
     """The worst violation of a constraint by a motion."""
 
+    bound: BoundConstraint
     worst: float = np.nan  # in the constraint's unit; NaN where the motion diverges
     time: float = np.nan
     row: str = ""
+
+    @property
+    def share(self) -> float:
+        """The violation relative to the constraint's range."""
+        return self.worst / (10.0 * self.bound.scale)
 
     @property
     def where(self) -> str:
@@ -261,55 +250,29 @@ class Played(NamedTuple):
 
 
 def played(
-    problem: OptimalControlProblem,
-    fine: OptimalControlProblem,
-    commands: Commands,
-    integrator: Integrator,
-    margins: Sequence[Floats] | None = None,
+    problem: OptimalControlProblem, fine: OptimalControlProblem, commands: Commands, integrator: Integrator
 ) -> Played:
     """The motion of a problem under commands on ``fine``, the same :meth:`in_parts`."""
     motion, failure = rollout(fine.scene, integrator, fine.q0, fine.v0, commands, fine.dt)
-    parts = fine.steps // problem.steps
     if failure is not None:
         lost = np.full((1, fine.q0.size), np.nan)
-        return Played(np.nan, lost[0], [Outside()] * len(fine.bound_constraints), lost)
+        return Played(np.nan, lost[0], [Outside(bound) for bound in fine.bound_constraints], lost)
     cost = float(fine.costs(motion.q, motion.v, fine.control_rows(motion)))
-    outside = _outside(problem, fine, motion, parts, margins)
-    return Played(cost, motion.q[-1], outside, motion.q[::parts])
+    return Played(cost, motion.q[-1], _outside(problem, fine, motion), motion.q[:: fine.steps // problem.steps])
 
 
-def _outside(
-    problem: OptimalControlProblem,
-    fine: OptimalControlProblem,
-    motion: Trajectory,
-    parts: int,
-    margins: Sequence[Floats] | None = None,
-) -> list[Outside]:
-    """The worst violation of each constraint by a motion on ``fine``, with margins (K, rows) at the plan's nodes."""
+def _outside(problem: OptimalControlProblem, fine: OptimalControlProblem, motion: Trajectory) -> list[Outside]:
+    """The worst violation of each constraint, without margins, by a motion on ``fine``."""
     found = []
-    for k, (whole, bound) in enumerate(zip(problem.bound_constraints, fine.bound_constraints, strict=True)):
+    for whole, bound in zip(problem.bound_constraints, fine.bound_constraints, strict=True):
         c = bound.value(motion.q, motion.v, fine.control_rows(motion))
-        if margins is not None and not (bound.of_controls or bound.source.equality):
-            c = c + _within_steps(margins[k], parts)
         excess = np.abs(c) if bound.source.equality else np.maximum(c, 0.0)
         outside = at_start(problem, whole)
         if outside is not None:
             # A row that is violated at the start cannot hold before the first node.
-            excess[: parts - 1, outside > 0.0] = 0.0
+            excess[: fine.steps // problem.steps - 1, outside > 0.0] = 0.0
         sample, row = np.unravel_index(int(np.argmax(excess)), excess.shape)
-        found.append(Outside(float(excess[sample, row]), float(bound.times[sample]), bound.rows[row]))
-    return found
-
-
-def _within_steps(margin: Floats, parts: int) -> Floats:
-    """Margins (K parts, rows) in parts of steps, from those at the nodes after the first (K, rows).
-
-    Their squares are linear in time, as variances under constant noise are, and no margin is larger than at the end.
-    """
-    squares = np.concatenate([np.zeros_like(margin[:1]), margin**2])
-    share = np.arange(1, parts + 1)[:, None] / parts
-    inner = squares[:-1, None] + share * (squares[1:] - squares[:-1])[:, None]
-    found: Floats = np.minimum(np.sqrt(inner), margin[:, None]).reshape(-1, margin.shape[1])
+        found.append(Outside(bound, float(excess[sample, row]), float(bound.times[sample]), bound.rows[row]))
     return found
 
 
@@ -323,57 +286,16 @@ def at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats |
 
 
 class OnRobot(NamedTuple):
-    """A plan on the continuous system.
+    """A plan on the continuous system, and how it was found.
 
     Attributes:
-        opened: True cost under its controls alone; NaN where the motion diverges.
-        closed: The same with feedback.
-        known: Whether the costs decide on a wish. Where the loss with feedback exceeds the wish by far, they are rough.
-        violation: Largest violation of a constraint with feedback, relative to the constraint's range; NaN where the
-            motion diverges.
-        where: The constraint that is violated most, by how much and where, in words; empty where all hold.
+        opened: Under its controls alone.
+        closed: With feedback.
+        substeps: Parts of the plan's steps.
+        accuracy: Relative change of the cost that changed more by the last doubling of the parts.
+        decided: Whether the cost with feedback is surely greater than a bound.
+        integrator: The accurate integrator.
     """
-
-    opened: float
-    closed: float
-    known: bool
-    violation: float = 0.0
-    where: str = ""
-
-
-def true_costs(
-    problem: OptimalControlProblem,
-    plan: Trajectory,
-    planned_cost: float,
-    policy: Policy,
-    *,
-    wish: float,
-    accuracy: float,
-    max_substeps: int = 1024,
-) -> OnRobot:
-    """The true costs under a plan's controls alone and with feedback, whether they decide on a wish, and violations.
-
-    Args:
-        wish: Greatest allowed loss with feedback, relative to ``planned_cost``.
-        accuracy: Relative accuracy of costs within the wish.
-    """
-    above = planned_cost + _FAR * wish * abs(planned_cost)
-    # Motions are seen at the ends of substeps only.
-    least = _LOOKS if problem.constraints else 2
-    found = _on_robot(problem, plan, policy, tolerance=accuracy, max_substeps=max_substeps, above=above, substeps=least)
-    told = OnRobot(found.opened.cost, found.closed.cost, found.known)
-    bounds = problem.bound_constraints
-    shares = [own.worst / (10.0 * bound.scale) for own, bound in zip(found.closed.outside, bounds, strict=True)]
-    if not shares or not np.isfinite(shares).all():
-        return told._replace(violation=np.nan if shares else 0.0)
-    i = int(np.argmax(shares))
-    own = found.closed.outside[i]
-    words = f"{bounds[i].source.label} is violated by {own.worst:.2g} {bounds[i].unit} ({own.where})"
-    return told._replace(violation=shares[i], where=words if own.where else "")
-
-
-class _OnRobot(NamedTuple):
-    """A plan under its controls alone and with feedback on the continuous system, and how it was found."""
 
     opened: Played
     closed: Played
@@ -385,42 +307,60 @@ class _OnRobot(NamedTuple):
     @property
     def known(self) -> bool:
         """Whether the costs are good enough, greater than a bound, or infinite."""
-        return self.accuracy <= _UNKNOWN or self.decided or not np.isfinite([self.opened[0], self.closed[0]]).any()
+        return self.accuracy <= _UNKNOWN or self.decided or not np.isfinite([self.opened.cost, self.closed.cost]).any()
+
+    @property
+    def violation(self) -> float:
+        """Largest violation with feedback, relative to the constraint's range; NaN where the motion diverges."""
+        return float(np.max([own.share for own in self.closed.outside], initial=0.0))
+
+    @property
+    def beyond(self) -> str:
+        """The constraint that is violated most, by how much and where, in words; empty where all hold."""
+        worst = max(self.closed.outside, key=lambda own: own.share, default=None)
+        if worst is None or not worst.where:
+            return ""
+        return f"{worst.bound.source.label} is violated by {worst.worst:.2g} {worst.bound.unit} ({worst.where})"
 
 
-def _on_robot(
+def on_robot(
     problem: OptimalControlProblem,
     plan: Trajectory,
     policy: Policy,
     *,
     tolerance: float,
-    max_substeps: int,
+    max_substeps: int = 1024,
     progress: Callable[[int, int], None] | None = None,
     above: float = np.inf,
     substeps: int = 2,
-) -> _OnRobot:
-    """A plan on the continuous system, also where the cost with feedback is surely greater than ``above``."""
-    first, fastest = substeps, problem.dt * rate_at_rest(problem.scene, problem.q0)
+) -> OnRobot:
+    """A plan on the continuous system.
+
+    The parts of steps, ``substeps`` at first, double until the relative change of both costs is at most ``tolerance``,
+    or the cost with feedback is surely greater than ``above``. Where the explicit method does not reach that because of
+    fast dampers or dry friction, the L-stable one repeats the comparison.
+    """
+    fastest = problem.dt * rate_at_rest(problem.scene, problem.q0)
     members = (_FAST,) if fastest > _FASTER else (_USUAL, _FAST)
     for integrator in (_CLOSED,) if problem.scene.constraints else members:
-        substeps, before = first, (np.nan, np.nan)
+        parts, before = substeps, (np.nan, np.nan)
         while True:
             if progress is not None:
-                progress(substeps, max_substeps)
-            fine = problem.in_parts(substeps)
-            commands = in_parts(problem, problem.decided(plan), policy, integrator, substeps)
+                progress(parts, max_substeps)
+            fine = problem.in_parts(parts)
+            commands = in_parts(problem, problem.decided(plan), policy, integrator, parts)
             opened, closed = (played(problem, fine, each, integrator) for each in commands)
             changes = [
                 abs(now.cost - then) / max(abs(now.cost), np.finfo(float).tiny)
                 for now, then in zip((opened, closed), before, strict=True)
                 if np.isfinite(now.cost) and np.isfinite(then)
             ]
-            decided = closed.cost - above > abs(closed.cost - before[1])
+            decided = bool(closed.cost - above > abs(closed.cost - before[1]))
             before, accuracy = (opened.cost, closed.cost), max(changes, default=np.inf)
-            if decided or accuracy <= tolerance or 2 * substeps > max_substeps:
+            if decided or accuracy <= tolerance or 2 * parts > max_substeps:
                 break
-            substeps *= 2
-        found = _OnRobot(opened, closed, substeps, accuracy, bool(decided), integrator)
+            parts *= 2
+        found = OnRobot(opened, closed, parts, accuracy, decided, integrator)
         if found.known or not problem.scene.dissipates:
             break
     return found
@@ -440,10 +380,11 @@ def in_parts(
 
 def _defect(problem: OptimalControlProblem, plan: Trajectory, substeps: int, integrator: Integrator) -> float:
     """Largest distance in q between the plan's steps and accurate ones from the same nodes; NaN where one diverges."""
-    h, off = problem.dt / substeps, []
-    for k in range(plan.steps):
-        line = open_line(plan.u_nodes[k : k + 2], integrator.stage_times) if problem.linear else None
-        commands = (line or open_loop(plan.u[k : k + 1]))._replace(hold=substeps)
-        motion, failure = rollout(problem.scene, integrator, plan.q[k], plan.v[k], commands, h)
-        off.append(np.nan if failure else float(np.abs(motion.q[-1] - plan.q[k + 1]).max()))
-    return float(np.max(off, initial=0.0))
+    u = plan.u_nodes[1:] if problem.linear else plan.u
+    commands = open_loop(u)._replace(hold=substeps, own=1)
+    if problem.linear:
+        times = np.array(integrator.stage_times or (0.5,))
+        commands = commands._replace(before=plan.u_nodes[:-1].copy(), stage_times=times)
+    begins = plan.q[:-1].copy(), plan.v[:-1].copy()
+    found = integrator.motions(quiet(problem.scene), *begins, commands, problem.dt / substeps)
+    return np.nan if found is None else float(np.abs(found[0][:, -1] - plan.q[1:]).max(initial=0.0))

@@ -7,9 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.costs.base import BoundCost, BoundTerm, Points
-from varpin.control.costs.least_squares import (
+from varpin.control.costs.base import (
+    BoundCost,
+    BoundTerm,
     LeastSquares,
+    Points,
     ReferenceValues,
     checked_reference,
     checked_weight,
@@ -158,7 +160,7 @@ class JointLimitBarrier(_Barrier):
     """weight . (what q is beyond a limit less a margin)^2: keep joints within their limits.
 
     A penalty that begins ``margin`` before the limit and is zero farther inside; it is finite beyond the limit, so that
-    a search may begin there. ``Solution.violations`` has the remaining excess.
+    a search may begin there.
     """
 
     _block = 0
