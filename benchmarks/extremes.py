@@ -121,7 +121,8 @@ def scenes(path: Path, *, deep: bool) -> int:
 
     record = battery.run(deep=deep, progress=lambda done, cells: sys.stderr.write(f"\r{done}/{cells}"))
     path.write_bytes(pickle.dumps(record))
-    print(f"\n{record}, {len(record.needless())} warnings without need")
+    needless = sum(cell.kind is Kind.DEGRADED and not cell.found for cell in record.runs)
+    print(f"\n{record}, {needless} warnings without need")
     for cell in record.wrong():
         print(f"  silent wrong: {cell.trial}, {cell.integrator}: {'; '.join(cell.found)}")
     return 1 if record.wrong() else 0

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 import varpin as vp
-from varpin.model.example_robot_data import locate, package_dir
+from varpin.model.example_robot_data import robots_dir
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent / "benchmarks"))
@@ -201,8 +201,7 @@ def main() -> None:
         return
     given = {str(folder): folder for folder in request.folders}
     if not request.print:
-        own = package_dir(locate("panda_description/urdf/panda.urdf")) / "example-robot-data" / "robots"
-        given = {"example-robot-data": own, **given}
+        given = {"example-robot-data": robots_dir(), **given}
     known: dict[str, dict[str, Any]] = {}
     if request.record is not None and request.record.exists():
         known = json.loads(request.record.read_text(encoding="utf-8"))

@@ -120,11 +120,3 @@ def test_copies_and_files_know_the_option(tmp_path):
     assert vp.Solution.load(tmp_path / "older.npz", alone).controls.tobytes() == plan.controls.tobytes()
     with pytest.raises(vp.InputError, match="between_nodes"):
         reach(between_nodes="yes")
-
-
-@pytest.mark.parametrize(("given", "expected"), [("", False), ("between_nodes = true", True)])
-def test_scene_files_have_the_option(tmp_path, given, expected):
-    cost = '[[cost]]\ntype = "control"\nweight = 1e-4\n'
-    path = tmp_path / "scene.toml"
-    path.write_text(f'[robot]\nsource = "ur5"\n[horizon]\ndt = 0.1\nsteps = 6\n{given}\n{cost}')
-    assert vp.load_scene(path).problem.between_nodes is expected

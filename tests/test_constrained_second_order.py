@@ -77,21 +77,3 @@ def test_against_differences_of_steps_along_the_constraints(kind, integrator):
         terms, bends = slope[:, None] * H * slope, z @ J * bend
         size = max(np.abs(terms).max(), np.abs(bends).max())
         assert abs(second(ends) - terms.sum() - bends.sum()) < 1e-7 * size
-
-
-def test_a_step_in_parts_is_chained():
-    scene, q, v = five_bar()
-    given = {"dt": 0.1, "steps": 1, "integrator": vp.Gauss(2), "check": False}
-    motion = vp.simulate(scene, q, 5.0 * v, **given)
-    assert motion.statistics.substeps[0] > 1
-    z, M = np.arange(1.0, 9.0), scene.core.jets(q[None], np.zeros((1, 4)))[0][0]
-    along = along_constraints(scene, q, np.array([0.3, 1.0, -0.5, 0.2]))
-
-    def gradient(k):
-        moved = vp.simulate(scene, q, 5.0 * v + k * SIZE * along, **given)
-        np.testing.assert_array_equal(moved.statistics.substeps, motion.statistics.substeps)
-        return z @ vp.linearize(scene, moved).A[0]
-
-    slope = first({k: gradient(k) for k in range(-4, 5)})
-    H = vp.second_order(scene, motion, z).xx[0]
-    np.testing.assert_allclose(H @ np.append(np.zeros(4), M @ along), slope, atol=1e-7 * np.abs(slope).max())

@@ -34,14 +34,6 @@ def linear(
     )  # fmt: skip
 
 
-def finger(rate, integrator=None, steps=12, hold=1, noise=None, dt=8e-3):
-    scene = vp.Scene(vp.load_robot("finger"), damping=3e-5, noise=noise)
-    cost = vp.TrackingCost([0.8, 0.3, 0.2], 10.0) + vp.ControlCost(0.1) + vp.Terminal(vp.TrackingCost([0.8, 0.3, 0.2]))
-    return vp.OptimalControlProblem(
-        scene, cost + rate, [1.0, 0.0, 0.0], np.zeros(3), dt=dt, steps=steps, hold=hold, integrator=integrator
-    )
-
-
 def plain_rate(u, weight, before, period):
     """Change by change."""
     W = np.asarray(weight) * np.eye(u.shape[1]) if np.ndim(weight) < 2 else np.asarray(weight)
@@ -99,19 +91,6 @@ def test_noise_is_known_to_the_law():
     assert lost.cost > found.cost + 4.0 * found.standard_error
 
 
-@pytest.mark.parametrize("weight", [0.0, 1e-14])
-def test_without_weight_it_is_not_there(weight):
-    options = {"noise": vp.ControlNoise(0.2), "hold": 2, "limits": (-0.9, 0.9)}
-    bare = vp.solve(linear(**options))
-    rated = vp.solve(linear(vp.ControlRateCost(weight), **options))
-    assert bare.previous_gains is None
-    assert bare.policy.previous_gains is None
-    assert rated.cost == pytest.approx(bare.cost, rel=1e-11)
-    np.testing.assert_allclose(rated.controls, bare.controls, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(rated.gains, bare.gains, rtol=0, atol=1e-9 * np.abs(bare.gains).max())
-    assert np.abs(rated.previous_gains).max() <= 1e4 * weight
-
-
 def random_policy(scene, steps, hold=1, before=None, limits=None):
     rng = np.random.default_rng(5)
     n, m = scene.robot.dof, scene.controls
@@ -161,22 +140,6 @@ def test_ensembles_feed_the_control_before_of_each_path_back(monkeypatch, before
             alone = vp.simulate(scene, [0.3, -0.4], [0.5, 0.1], rng=child, **options)
             assert alone.u.tobytes() == paths.u[path].tobytes()
             assert alone.q.tobytes() == paths.q[path].tobytes()
-
-
-def test_noise_of_ones_own_is_stepped_in_python_with_the_same_feedback():
-    """A field that only Python knows, and the same one compiled."""
-
-    policy = random_policy(vp.Scene(sliders(2)), 10, 2, BEFORE)
-    motions = []
-    for noise in (vp.AdditiveNoise(0.4), vp.CustomNoise(lambda q, v, u: 0.4 * np.eye(2), 2)):
-        scene = vp.Scene(sliders(2), gravity=False, damping=0.3, noise=noise)
-        for integrator in (vp.Midpoint(), vp.RungeKutta4()):
-            motions.append(
-                vp.simulate(scene, [0.3, -0.4], [0.5, 0.1], dt=0.05, steps=20, controls=policy, rng=2,
-                            integrator=integrator)
-            )  # fmt: skip
-    for compiled, own in zip(motions[:2], motions[2:], strict=True):
-        np.testing.assert_allclose(own.u, compiled.u, rtol=0, atol=1e-12)
 
 
 def test_the_rest_of_an_optimum_is_the_optimum_of_the_rest():
@@ -233,13 +196,9 @@ def test_mpc_joins_its_plans():
     np.testing.assert_array_equal(free.plans[1].problem.rate.before, free.motion.u[0])
 
 
-def test_a_rate_within_a_cost_of_ones_own_is_refused():
-    class Wrapped(vp.Cost):
-        def bind(self, points):
-            return vp.ControlRateCost(1.0).bind(points)
-
-    with refused(vp.InputError, "cost"):
-        linear(Wrapped())
+class Wrapped(vp.Cost):
+    def bind(self, points):
+        return vp.ControlRateCost(1.0).bind(points)
 
 
 def test_verification_counts_the_changes_that_are_made():
@@ -253,8 +212,6 @@ def test_verification_counts_the_changes_that_are_made():
     found = sol.verify()
     assert found.open_loop_cost == pytest.approx(sol.cost, rel=1e-11)
     assert found.closed_loop_cost == pytest.approx(sol.cost, rel=1e-11)
-    bent = finger(vp.ControlRateCost(2e-3), hold=2, dt=2e-3, steps=48)
-    assert abs(vp.solve(bent).verify(tolerance=1e-6).closed_loop_loss) < 0.05
 
 
 def test_sums_scales_and_words():
@@ -271,13 +228,13 @@ def test_sums_scales_and_words():
     ("make", "facts"),
     [
         (lambda: vp.ControlRateCost(-1.0), ("ControlRateCost", "weight", "positive semidefinite")),
-        (lambda: vp.ControlRateCost(1.0, np.nan), ("ControlRateCost", "before", "nan")),
+        (lambda: linear(vp.ControlRateCost(1.0, np.nan)), ("ControlRateCost", "before", "nan")),
         (
-            lambda: vp.ControlRateCost(1.0, np.zeros((2, 2))),
+            lambda: linear(vp.ControlRateCost(1.0, np.zeros((2, 2)))),
             ("before", "(2, 2)"),
         ),
         (lambda: vp.Terminal(vp.ControlRateCost()), ("ControlRateCost", "terminal")),
-        (lambda: vp.Terminal(2.0 * vp.ControlRateCost()), ("ControlRateCost", "terminal")),
+        (lambda: linear(Wrapped()), "cost"),
         (lambda: linear(vp.ControlRateCost([1.0, 1.0, 1.0])), ("2", "(3,)")),
         (lambda: linear(vp.ControlRateCost(1.0, np.zeros(3))), ("before", "(2,)", "(3,)")),
         (

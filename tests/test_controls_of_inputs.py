@@ -89,29 +89,6 @@ def test_a_tolerance_follows_a_function_of_time():
     assert np.abs(found.q[-1] - truth()[:3]).max() < 1e-6
 
 
-@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
-@pytest.mark.parametrize("period", [1, 4])
-def test_a_law_says_where_the_joint_is_at_the_end_of_its_period(interpolation, period):
-    scene = arm(interpolation)
-    dt = 0.01
-    asked = []
-
-    def law(t, q, v):
-        asked.append((t, q, v))
-        return wanted(scene, t + period * dt)
-
-    motion = vp.simulate(scene, Q0, V0, dt=dt, steps=42, controls=law, period=period, integrator=vp.Gauss(2))
-    at = np.arange(period, 43, period)
-    np.testing.assert_allclose(motion.q[at, 0], path(dt * at), atol=1e-13)
-    assert len(asked) == -(-42 // period)
-    # The last period ends after the motion: the joint is on its way.
-    again = vp.simulate(scene, Q0, V0, dt=dt, steps=42, controls=motion.u, integrator=vp.Gauss(2))
-    np.testing.assert_allclose(again.q, motion.q, atol=1e-12)
-    bound = 2e-2 if interpolation == "linear" else 1e-4
-    assert np.abs(motion.q[:, 0] - path(motion.t)).max() < bound
-    vp.linearize(scene, motion)
-
-
 @pytest.mark.parametrize("linear", [False, True])
 @pytest.mark.parametrize("hold", [1, 3])
 def test_a_policy_moves_an_input_over_its_intervals(hold, linear):

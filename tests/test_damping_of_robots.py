@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from findings import about
 from mechanisms import joint, link, mimic, write_urdf
@@ -44,13 +43,6 @@ def test_a_scene_that_leaves_dampers_out_says_so_once(arm, caplog):
     assert not scene.damping.any()
 
 
-@pytest.mark.parametrize("damping", [0, 0.0, [0.0, 0.0], {"j1": 0.2}, 0.1], ids=str)
-def test_damping_that_is_given_is_what_is_meant(arm, caplog, damping):
-    with caplog.at_level(logging.WARNING):
-        vp.Scene(arm(), damping=damping)
-    assert said(caplog) == []
-
-
 def test_nothing_is_said_where_the_description_has_none(arm, caplog):
     with caplog.at_level(logging.WARNING):
         vp.Scene(arm(("0", "0", "0"), ("0", "0", "0")))
@@ -77,13 +69,6 @@ def test_the_description_s_dampers_take_what_pinocchio_s_model_says(arm, caplog)
     np.testing.assert_array_equal(*ends)
 
 
-def test_models_in_memory_and_locked_joints():
-    model = pin.buildSampleModelManipulator()
-    model.damping = np.arange(1.0, 1.0 + model.nv)
-    held = vp.load_robot(model, lock={model.names[2]: 0.0})
-    np.testing.assert_array_equal(held.damping, np.delete(model.damping, 1))
-
-
 def test_other_words_are_refused(arm):
     with refused(vp.InputError, "damping", "'robot'"):
         vp.Scene(arm(), damping="urdf")
@@ -106,20 +91,3 @@ def test_scene_files_take_it(tmp_path, caplog):
     path.write_text(text.format('damping = "urdf"'))
     with refused(vp.SceneFileError, "'urdf'", "robot"):
         vp.load_scene(path)
-
-
-def test_the_command_line_takes_it(tmp_path, capsys):
-    from varpin.cli import main  # noqa: PLC0415
-
-    saved = tmp_path / "motion.npz"
-    command = ["simulate", "xarm7", "--dt", "1e-3", "--steps", "3", "--save", str(saved)]
-    for words, damping, told in (
-        ([], 0.0, True),
-        (["--damping", "robot"], 10.0, False),
-        (["--damping", "0"], 0, False),
-    ):
-        assert main([*command, *words]) == 0
-        assert (not unnamed(capsys.readouterr().err, "damping=0")) == told
-        assert vp.Trajectory.load(saved).scene_values["damping"][0] == damping
-    assert main([*command, "--damping", "robot", "1"]) != 0
-    assert not unnamed(capsys.readouterr().err, "--damping", "robot")

@@ -10,7 +10,6 @@ from findings import about
 from refusals import naming, refused, unnamed
 
 import varpin as vp
-from varpin.cli import main
 
 MASS = '<inertial pos="0.02 0.05 0.1" mass="1.3" diaginertia="0.02 0.03 0.025"/>'
 CONNECT = '<connect name="pin" body1="c" anchor="0.2 0 0" body2="d"/>'
@@ -155,13 +154,3 @@ def test_scene_files_take_them(tmp_path, looped, caplog):
     )
     with refused(vp.SceneFileError, "constraint[0]", "<joint> 'gear'"):
         vp.load_scene(path).scene  # noqa: B018
-
-
-def test_the_command_takes_them(tmp_path, looped, capsys):
-    q0 = vp.assemble(vp.Scene(looped, constraints="robot"), np.full(4, 0.1))
-    options = [str(looped.mjcf), "--duration", "0.1", "--constraints", "robot", "--q0", *map(repr, q0.tolist())]
-    assert main(["simulate", *options, "--save", str(tmp_path / "a.npz"), "--quiet"]) == 0
-    motion = vp.Trajectory.load(tmp_path / "a.npz")
-    assert motion.constraint_forces.shape[1] == 4
-    capsys.readouterr()
-    assert main(["advise", *options, "--tolerance", "1e-3"]) == 0

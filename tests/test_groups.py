@@ -61,10 +61,6 @@ class TestCuts:
             assert tree.groups == len(tree.ends)
         assert {1, 2, 3} <= seen
 
-    @pytest.mark.parametrize(("name", "ends"), [("ur5", [6]), ("allegro_right_hand", [4, 8, 12, 16])])
-    def test_of_named_robots(self, load, name, ends):
-        assert list(load(name).tree.ends) == ends
-
 
 @pytest.mark.parametrize("integrator", INTEGRATORS, ids=str)
 def test_together_as_each_alone(integrator):

@@ -6,7 +6,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from refusals import naming, refused, unnamed
-from scipy.linalg import eigh
 
 import varpin as vp
 from varpin.show.inspection import inspect_robot
@@ -72,10 +71,6 @@ def test_sound_arm_gives_no_warning_and_its_figures(tmp_path):
             ("non-physical inertia", "'link2'", "triangle inequality", "0.08 > 0.01 + 0.02"),
         ),
         (
-            (ROD, inertial(5e-4, 1e-6, 1e-6, 1e-6)),
-            ("masses", "'link1'", "'link2'", "2e+03", "0.0005 kg"),
-        ),
-        (
             (ROD, inertial(1, 0.08, 0.08, 0.08, x=500)),
             ("centre of mass", "'link2'", "500 m", "1 m"),
         ),
@@ -93,7 +88,8 @@ def test_faulty_link_is_named(tmp_path, links, facts):
 
 def test_inertia_that_its_shape_cannot_have():
     """A published UR5 gives its wrists a radius of gyration of 0.42 m, and they are as large as a hand."""
-    (warning,) = [text for text in inspect_robot("ur5").warnings if "implausibly large inertia" in text]
+    (warning,) = naming(inspect_robot("ur5").warnings, "implausibly large inertia")
+    assert not naming(inspect_robot("ur5", meshes=False).warnings, "inertia")
     assert not unnamed(warning, "'wrist_1_link'", "'wrist_2_link'", "'wrist_3_link'", "0.424 m", "0.14 m")
     assert not [text for text in inspect_robot("ur10").warnings if "inertia" in text]
 
@@ -104,18 +100,6 @@ def test_one_line_for_each_kind(tmp_path):
     (warning,) = report.warnings
     assert not unnamed(warning, "'link1'", "'link2'", "'link3'", "2 more")
     assert len(warning) <= 240
-
-
-def test_faulty_link_is_found_where_pinocchio_merges_it_into_a_sound_one(tmp_path):
-    tool = f'<link name="tool"><inertial>{inertial(0.1, 1e-4, 1e-4, 9e-4)}</inertial></link>'
-    tool += '<joint name="weld" type="fixed"><parent link="link1"/><child link="tool"/></joint>'
-    report = inspect_robot(write_arm(tmp_path, ROD, extra=tool))
-    (warning,) = report.warnings
-    assert not unnamed(warning, "'tool'", "non-physical inertia")
-
-
-def test_rod_without_thickness_is_no_fault():
-    assert not [text for text in inspect_robot(vp.planar_chain(3)).warnings if "inertia" in text]
 
 
 def test_singular_mass_matrix_names_the_joint_and_has_no_largest_step(tmp_path):
@@ -154,24 +138,6 @@ def test_ill_conditioned_mass_matrix_is_said(tmp_path):
     assert report.scaled_condition == pytest.approx(4 * 0.75 / 1e-7, rel=1e-5)
 
 
-def test_limits_that_are_missing_or_leave_no_room(tmp_path):
-    zeros = '<limit lower="0" upper="0" effort="0" velocity="0"/>'
-    for bare in (write_arm(tmp_path, ROD, ROD, joint=zeros), vp.planar_chain(2)):
-        report = inspect_robot(bare)
-        assert not report.warnings
-        assert str(report).count(" free ") == 2
-        assert str(report).count("none") == 4
-    tight = inspect_robot(
-        write_arm(tmp_path, ROD, ROD, joint='<limit lower="0.2" upper="0.2" effort="1" velocity="1"/>')
-    )
-    assert naming(tight.warnings, "0.2 and 0.2 of 'joint1'")
-
-
-def test_configuration_outside_the_limits_is_said_where_one_is_given(tmp_path):
-    path = write_arm(tmp_path, ROD, ROD)
-    assert naming(inspect_robot(path, q=[0.0, 3.0]).warnings, "'joint2'", "3", "-1 and 2")
-
-
 def test_mimic_joints_locked_joints_and_damping_are_said():
     report = inspect_robot("panda", lock={"panda_joint7": 0.5})
     mimic = next(joint for joint in report.joints if joint.kind == "mimic")
@@ -180,15 +146,6 @@ def test_mimic_joints_locked_joints_and_damping_are_said():
     assert "1 * panda_finger_joint1" in str(report)
     assert naming(report.warnings, "damping='robot'")
     assert inspect_robot("panda", mimic="free").robot.dof == 9
-
-
-def test_mimic_leader_that_does_not_exist_is_named(tmp_path):
-    follower = f'<link name="tip"><inertial>{ROD}</inertial></link>'
-    follower += '<joint name="follower" type="revolute"><parent link="link1"/><child link="tip"/><axis xyz="0 1 0"/>'
-    follower += f'<origin xyz="1 0 0"/><mimic joint="nobody"/>{LIMIT}</joint>'
-    report = inspect_robot(write_arm(tmp_path, ROD, extra=follower))
-    assert report.robot.dof == 2
-    assert naming(report.warnings, "'follower' of 'nobody'", "free")
 
 
 def test_continuous_and_prismatic_joints_are_told_apart(tmp_path):
@@ -214,35 +171,11 @@ def test_largest_step_of_a_pendulum_standing_up_and_hanging_down(tmp_path):
     assert inspect_robot(path, q=-np.pi / 2, gravity=False).largest_step == np.inf
 
 
-def test_largest_step_agrees_with_differences_of_pinocchios_energy():
-    q, v = np.array([0.3, -1.2, 1.0, 0.4, 0.2, 0.1]), np.array([1.0, -0.5, 2.0, 0.3, 1.0, -2.0])
-    report = inspect_robot("ur5", q=q, v=v)
-    model = pin.Model(report.robot.model)
-    model.gravity.linear = np.array([0.0, 0.0, -9.81])
-    data, eps = model.createData(), 1e-5
-
-    def lagrangian_gradient(at):
-        pin.computeCoriolisMatrix(model, data, at, v)
-        return data.C.T @ v - pin.computeGeneralizedGravity(model, data, at)
-
-    columns = [lagrangian_gradient(q + eps * e) - lagrangian_gradient(q - eps * e) for e in np.eye(6)]
-    Lqq = np.array(columns) / (2 * eps)
-    M = pin.crba(model, data, q)
-    M = np.triu(M) + np.triu(M, 1).T
-    fastest = eigh(0.5 * (Lqq + Lqq.T), M, eigvals_only=True)[-1]
-    assert report.largest_step == pytest.approx(2.0 * np.sqrt((1.0 - report.branch_margin) / fastest), rel=1e-6)
-
-
 def test_loaded_robot_is_taken_and_not_loaded_otherwise():
     robot = vp.planar_chain(2)
     assert inspect_robot(robot).robot is robot
     with refused(vp.InputError, "lock"):
         inspect_robot(robot, lock={"joint1": 0.0})
-
-
-def test_wrong_configuration_is_refused_in_words():
-    with refused(vp.InputError, "q", "(2,)", "(3,)"):
-        inspect_robot(vp.planar_chain(2), q=[0.0, 0.0, 0.0])
 
 
 def test_a_report_prints_its_tables_and_warnings():

@@ -73,20 +73,7 @@ def test_refusals() -> None:
             links(sampling=sampling)
     problem = links()
     plan = vp.solve(problem, check=False)
-    with refused(vp.InputError, "second-order", "variational"):
-        vp.solve(links(integrator=vp.RungeKutta4()), second_order=True)
     with refused(vp.InputError, "linear"):
         vp.solve(problem.at(controls="held"), plan)
     with refused(vp.InputError, "before"):
         vp.LinearPolicy(np.zeros((2, 1)), np.zeros((2, 1, 2)), np.zeros((2, 2)), linear=True)
-
-
-def test_links_too_light_for_the_plain_pass() -> None:
-    """A finger of some grams: the plain pass has lost its digits, and squares take over."""
-    scene = vp.Scene(vp.load_robot("finger"))
-    cost = vp.ControlCost(0.1) + vp.Terminal(vp.TrackingCost([1.0, 0.5, 0.4], 1.0))
-    q0, v0 = [0.5, 0.3, 0.2], np.zeros(3)
-    problem = vp.OptimalControlProblem(scene, cost, q0, v0, dt=0.01, steps=N, controls="linear")
-    plan = vp.solve(problem, max_iterations=3, check=False)
-    assert plan.cost < plan.history[0].cost or plan.status.converged
-    assert np.isfinite(plan.gains).all()

@@ -87,48 +87,6 @@ def test_searches_start_on_states(interpolation: str, controls: str) -> None:
     np.testing.assert_allclose(first.trajectory.q[:, 0], own.trajectory.q[:, 0], atol=1e-12)
 
 
-def noisy_pair(interpolation: str, **options: object) -> list[vp.OptimalControlProblem]:
-    """The same problem under noise that the core evaluates, and that Python does."""
-    m = 4 if interpolation == "cubic" else 3
-    intensity = np.zeros((3, 2, m))
-    intensity[1, 0, 1], intensity[2, 1, 2], intensity[1, 1, 2] = 0.3, 0.2, 0.1
-    python = vp.CustomNoise(lambda q, v, u: intensity @ u, 2, du=lambda q, v, u: intensity)
-    return [hand_and_motor(interpolation, noise=noise, **options) for noise in (vp.ControlNoise(intensity), python)]
-
-
-@pytest.mark.parametrize("kick", ["left", "held"])
-@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
-def test_noise_in_python_is_that_of_the_core(interpolation: str, kick: str) -> None:
-    """Beside inputs that move over a step, over the steps of a decision, and beside lines over one or several steps."""
-    core, python = noisy_pair(interpolation, integrator=vp.Gauss(2, kick=kick))
-    m, rng = core.scene.controls, np.random.default_rng(1)
-    u, gains, nodes = 0.5 * rng.normal(size=(7, m)), 0.05 * rng.normal(size=(6, m, 6)), np.zeros((6, 6))
-    u[0] = start_of(core)[0]
-    laws = [
-        (u[1:], 6, 0.08),
-        (vp.LinearPolicy(u[1:], gains, nodes, 3, "momentum", period=0.08), 18, 0.08 / 3),
-        (vp.LinearPolicy(u[1:], gains, nodes, on="momentum", before=u[0], linear=True, period=0.08), 6, 0.08),
-        (vp.LinearPolicy(u[1:], gains, nodes, on="momentum", before=u[0], linear=True, period=0.08), 12, 0.04),
-    ]
-    for controls, steps, dt in laws:
-        width = core.scene.increments(linear=isinstance(controls, vp.LinearPolicy) and controls.linear)
-        dw = np.sqrt(dt) * rng.normal(size=(steps, width))
-        one, other = (
-            vp.simulate(
-                problem.scene, problem.q0, problem.v0, dt=dt, steps=steps, controls=controls, increments=dw,
-                integrator=problem.integrator, check=False,
-            )
-            for problem in (core, python)
-        )  # fmt: skip
-        np.testing.assert_allclose(other.q, one.q, atol=1e-11)
-        np.testing.assert_allclose(other.v, one.v, atol=1e-10)
-        np.testing.assert_allclose(other.u, one.u, atol=1e-11)
-        assert np.abs(one.q[-1] - one.q[0]).max() > 0.1
-        found, expected = (vp.linearize(problem.scene, motion) for problem, motion in ((python, other), (core, one)))
-        for name in ("A", "G", "Gx", "Gu"):
-            np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-10)
-
-
 def test_noise_of_the_position_of_an_input_is_differentiated_at_the_end_of_the_step() -> None:
     """Its derivatives in the controls at both ends of a line, by differences of the fields there."""
     own = vp.CustomNoise(

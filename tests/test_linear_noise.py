@@ -115,17 +115,6 @@ def test_paths_cost_what_the_plan_expects(noise: object, integrator: vp.Integrat
     assert first.cost == pytest.approx(np.mean(again) + within, rel=1e-12)
 
 
-def test_an_ensemble_stores_the_controls_of_lines() -> None:
-    problem = reach(CONTROL, integrator=vp.Gauss(2))
-    plan = vp.solve(problem, check=False)
-    given = {"dt": problem.dt, "steps": problem.steps, "controls": plan.policy, "integrator": problem.integrator}
-    paths = vp.simulate_ensemble(problem.scene, problem.q0, problem.v0, paths=3, rng=1, store=True, **given)
-    for path, child in enumerate(np.random.default_rng(1).spawn(3)):
-        alone = problem.simulate(plan.policy, rng=child)
-        np.testing.assert_allclose(paths.q[path], alone.q, atol=1e-13)
-        np.testing.assert_allclose(paths.u[path], alone.u, atol=1e-12)
-
-
 @pytest.mark.parametrize("rate", [0.0, 1e-2])
 def test_the_noise_cost_in_halves_is_that_of_each_impulse(rate: float) -> None:
     """Of a linear system the cost is quadratic in the increments: their second differences are its mean under noise."""
@@ -200,24 +189,6 @@ def test_the_covariance_along_a_line_is_that_of_continuous_noise(integrator: vp.
     np.testing.assert_allclose(drawn, found, rtol=3.0 * np.sqrt(2.0 / 2000))
 
 
-def test_halves_of_lines_have_the_impulses_of_whole_ones() -> None:
-    """Of one Brownian path, linear in each half: its increments in halves are those of the mean and of the slope."""
-    halves = np.random.default_rng(2).normal(size=(10, 1)) * np.sqrt(0.05)
-    first, second = halves[::2], halves[1::2]
-    ends, h = LINE.u, 0.1
-    given = {"integrator": vp.Gauss(2, kick="held"), "check": False}
-    fine = vp.simulate(FREE, [0.0], [0.0], dt=h / 2, steps=10, controls=LINE.refined(2), increments=halves, **given)
-    quiet = vp.simulate(FREE, [0.0], [0.0], dt=h / 2, steps=10, controls=LINE.refined(2), increments=0.0, **given)
-    mean, change = 0.5 * (ends[:-1] + ends[1:]), ends[1:] - ends[:-1]
-    impulse = 0.4 * (mean * (first + second) + 0.25 * change * (second - first))
-    np.testing.assert_allclose((fine.p - quiet.p)[::2, 0], np.cumsum([0.0, *impulse[:, 0]]), atol=1e-12)
-    # As increments of the whole steps; sqrt(12) / 4 of the difference are those of the slope.
-    dw = np.hstack([first + second, 0.25 * np.sqrt(12.0) * (second - first)])
-    whole = vp.simulate(FREE, [0.0], [0.0], dt=h, steps=5, controls=LINE, increments=dw, **given)
-    np.testing.assert_allclose(whole.p, fine.p[::2], atol=1e-12)
-    assert whole.dw.shape == (5, 2)
-
-
 @pytest.mark.parametrize(
     ("kick", "constrained"), [("left", False), ("split", False), ("held", False), ("left", True), ("held", True)]
 )
@@ -239,18 +210,6 @@ def test_paths_on_lines_are_repeated_and_examined_with_their_noise(kick: str, co
     zeros = np.hstack([motion.dw[:, :4], np.zeros((200, 2))])
     np.testing.assert_array_equal(means.q, vp.simulate(scene, [0.2, 0.2], [0.0, 0.0], increments=zeros, **given).q)
     assert np.abs(means.q - motion.q).max() > 1e-6
-
-
-@pytest.mark.parametrize("slopes", [False, True])
-@pytest.mark.parametrize("kick", ["left", "split"])
-def test_kicks_of_strong_noise_on_lines_are_no_error_of_the_motion(kick: str, slopes: bool) -> None:
-    """A kick is of the control over the whole step, also where the check repeats the step in parts."""
-    scene = vp.Scene(vp.planar_chain(2), damping=0.2, noise=vp.ControlNoise(0.3))
-    controls = vp.FirstOrderHold(10.0 * np.sin(np.linspace(0.0, 30.0, 41))[:, None] * [1.0, -0.5])
-    dw = 0.2 * np.random.default_rng(1).normal(size=(40, 4))
-    given = {"dt": 0.04, "steps": 40, "controls": controls, "integrator": vp.Gauss(2, kick=kick)}
-    motion = vp.simulate(scene, [0.2, 0.2], [0.0, 0.0], increments=dw if slopes else dw[:, :2], **given)
-    assert motion.warnings == ()
 
 
 @pytest.mark.parametrize("integrator", [vp.Gauss(2), vp.Gauss(2, kick="held"), vp.RungeKutta4()], ids=str)

@@ -38,20 +38,15 @@ def document(equality, *sections, world=ARM, compiler='angle="radian"'):
 RELPOSE = 'relpose="0.3 0.1 0.2 0.8 0.2 0.1 0.4"'
 KINDS = {
     "connect to the world": '<connect body1="b" anchor="0.1 0.2 0.3"/>',
-    "connect of two bodies": '<connect body1="ay" body2="b" anchor="0.1 0.2 0.3"/>',
-    "connect to a body that stands": '<connect body1="stand" body2="b" anchor="0.1 0.2 0.3"/>',
     "connect of two sites": '<connect site1="pad" site2="a"/>',
     "connect to a site of the world": '<connect site1="mark" site2="a"/>',
-    "joint on joint": '<joint joint1="ax" joint2="bz"/>',
     "joint on joint by a polynomial": '<joint joint1="ax" joint2="cz" polycoef="0.1 0.7 -0.3 0.2 0.05"/>',
     "slide on joint": '<joint joint1="a" joint2="az" polycoef="0 0.1 0 0 0"/>',
     "joint alone": '<joint joint1="ay" polycoef="0.3 1 2 0 0"/>',
 }
 WELDS = {
     "weld to the world": '<weld body1="b"/>',
-    "weld of two bodies": '<weld body1="ay" body2="b"/>',
     "weld at an anchor": '<weld body1="ay" body2="b" anchor="0.1 0.2 0.3"/>',
-    "weld by a pose": f'<weld body1="ay" body2="b" {RELPOSE}/>',
     "weld by a pose at an anchor": f'<weld body1="ay" body2="b" anchor="0.1 0.2 0.3" {RELPOSE}/>',
     "weld of sites": '<weld site1="tool" site2="a"/>',
     "weld of points": '<weld body1="ay" body2="b" anchor="0.1 0.2 0.3" torquescale="0"/>',

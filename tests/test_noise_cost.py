@@ -8,7 +8,6 @@ from scipy.linalg import expm
 
 import varpin as vp
 from varpin.control.noise import noise_cost
-from varpin.control.samples import means_of_decay
 from varpin.control.stages import Feedback, Steps
 
 LEVEL, DAMPING = 0.3, 1.5
@@ -88,12 +87,6 @@ def test_a_plan_whose_steps_are_long_for_the_noise_says_so():
     assert "agrees" not in sentence
 
 
-def test_one_whose_steps_are_short_does_not():
-    short = plan(0.005, hold=20)
-    assert short.noise_cost == pytest.approx(exact(short), rel=0.05)
-    assert not about(short.warnings, "noise within steps")
-
-
 @pytest.mark.parametrize("damping", [0.0, 2.0, 20.0])
 def test_in_the_long_steps_of_a_plan_it_is_close_to_that_of_fine_steps(damping):
     """The default's, of position costs; an impulse before each step costs half as much again and more."""
@@ -125,21 +118,6 @@ def test_what_velocities_cost_within_steps(damping):
     variance = (level / inertia) ** 2 / (2.0 * rate)
     mean = dt - (1.0 - np.exp(-2.0 * rate * dt)) / (2.0 * rate)
     assert found == pytest.approx(variance * mean, rel=1e-5)
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-3, 3.0, 1e4])
-def test_the_mean_of_what_decays_within_a_step(size):
-    """Against the matrix exponential, with a matrix that has no basis of modes."""
-    Z = size * np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 0.3], [0.0, 0.0, 2.0]])
-    root = np.random.default_rng(0).normal(size=(3, 3))
-    H = root.T @ root
-    found = means_of_decay(Z[None], H[None])[0][0]
-    # d/ds of exp(-Z s)' H exp(-Z s) is linear in it; the integral is the last block of the exponential of a chain.
-    rates = np.zeros((27, 27))
-    rates[:9, :9] = -(np.kron(Z.T, np.eye(3)) + np.kron(np.eye(3), Z.T))
-    rates[9:18, :9] = rates[18:, 9:18] = np.eye(9)
-    right = (expm(rates) @ np.concatenate([H.ravel(), np.zeros(18)]))[18:].reshape(3, 3)
-    np.testing.assert_allclose(found, right, rtol=0, atol=1e-12 * np.abs(right).max())
 
 
 @pytest.mark.parametrize(("strength", "told"), [(5e-4, True), (5e-5, False)])

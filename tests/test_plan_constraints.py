@@ -1,6 +1,5 @@
 """Hard constraints of plans: against SciPy on the same grid, KKT conditions by differences, what is refused."""
 
-from contextlib import ExitStack
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +15,6 @@ from varpin.control import ViolationOnRobot
 from varpin.control.checks import foreseen, reach
 from varpin.model.clearance import capsule_around, clearance
 from varpin.model.kinematics import frame_kinematics
-from varpin.support.one_thread import one_thread
 
 
 def two_links(constraints=(), *, steps=24, cost=None, **options):
@@ -42,14 +40,6 @@ FAMILIES = {
     "out of a sphere": [vp.KeepOutOfSphere(ROBOT, "tip", [1.3, 0.0, -1.3], 0.3)],
     "two": [vp.WithinVelocityLimits(ROBOT, (-1.5, 1.5)), vp.WithinControlRate(150.0)],
 }
-
-
-@pytest.mark.parametrize("length", [0.1, 1.0, 7.0])
-def test_a_half_space_is_what_its_formula_says(length):
-    normal, offset, q = length * np.array([0.6, 0.0, 0.8]), -0.3 * length, np.array([[0.2, 0.4], [-1.0, 0.3]])
-    plane = vp.KeepInHalfSpace(ROBOT, "tip", normal, offset)
-    p = ROBOT.frame_positions(q)
-    np.testing.assert_allclose(plane.distances(p)[:, 0], (offset - p @ normal) / length, atol=1e-15)
 
 
 def falling_at_first():
@@ -82,30 +72,6 @@ def test_a_plan_that_would_cost_next_to_nothing_without_its_limit(weight):
     plan = vp.solve(problem, check=False)
     assert plan.status.converged, plan.reason
     assert plan.trajectory.q[-1, 0] == pytest.approx(1.0, abs=1e-6)
-
-
-def test_servos_within_velocity_limits():
-    """A stiff servo: in steps that the guard divides the search would find no plan, and call the limits infeasible."""
-    robot = vp.load_robot("ur5")
-    begin = np.array([0.0, -1.2, 1.2, -1.0, -1.5, 0.0])
-    end = begin + np.array([1.0, 0.4, -0.4, 0.5, 0.3, 0.2])
-    scene = vp.Scene(robot, forces=[vp.PositionServo(4000.0, 2.0 * np.sqrt(4000.0))])
-    cost = vp.TrackingCost(end) + vp.VelocityCost(1e-2) + vp.ControlCost(1e-3, end)
-    cost += vp.Terminal(vp.TrackingCost(end, 100.0) + vp.VelocityCost(10.0))
-    limits = vp.WithinVelocityLimits(robot, (-2.0, 2.0))
-    problem = vp.OptimalControlProblem(scene, cost, begin, np.zeros(6), dt=0.02, steps=40, constraints=[limits])
-    plan = vp.solve(problem, check=False)
-    assert plan.status.converged
-    assert len(plan.history) <= 30
-    assert plan.violation <= 1e-6
-    assert plan.constraints[0].active.any()
-
-
-def test_given_limits_that_are_all_infinite():
-    robot = vp.planar_chain(2)
-    for made in (vp.WithinJointLimits, vp.WithinVelocityLimits):
-        with pytest.raises(vp.InputError, match="all limits given are infinite"):
-            made(robot, (-np.inf, np.inf))
 
 
 @pytest.mark.parametrize("torque", [1e-6, 1e-3])
@@ -272,31 +238,6 @@ def test_capsule_distances_are_coals():
         assert own[0, 0] == pytest.approx(known, abs=1e-6)
 
 
-def test_arm_goes_around_a_post():
-    """A tool behind a post: every link stays clear of it, which without the constraint it does not."""
-    robot = vp.load_robot("ur5")
-    begin = np.array([0.0, -1.2, 1.4, -1.8, -1.57, 0.0])
-    end = begin + np.eye(6)[0] * 1.6
-    post = vp.Obstacle.capsule([0.4, 0.45, 0.0], [0.4, 0.45, 0.55], 0.06, name="post")
-    clear = vp.KeepClear(robot, [post], 0.02)
-    goal = vp.ReachFrame(robot, "tool0", position=robot.frame_positions(end, "tool0"))
-    cost = vp.ControlCost(1.0 / robot.effort_limit**2) + vp.VelocityCost(0.2)
-    cost += vp.Terminal(vp.TrackingCost(end, 1.0) + vp.VelocityCost(100.0))
-    options = {"dt": 0.05, "steps": 30, "control_limits": (-robot.effort_limit, robot.effort_limit)}
-    plans = [
-        vp.solve(
-            vp.OptimalControlProblem(vp.Scene(robot, damping=0.1), cost, begin, np.zeros(6), constraints=c, **options),
-            check=False,
-        )
-        for c in ([goal], [goal, clear])
-    ]
-    apart = [clearance(robot, [post]).distances(plan.trajectory.q).min() for plan in plans]
-    assert apart[0] < -0.01
-    assert apart[1] >= 0.02 - 1e-6
-    assert plans[1].violation <= 1e-6
-    assert plans[1].status is vp.Status.CONVERGED
-
-
 def test_monte_carlo_counts_what_margins_allow():
     """As an ensemble of the same seed does, of the bound and the node where most paths are outside."""
     limits = vp.WithinJointLimits(ROBOT, (-0.2, [0.9, 0.6]), margin=2.0)
@@ -322,11 +263,6 @@ def test_monte_carlo_counts_what_margins_allow():
     assert abs(share - 0.02275) < 5.0 * one.standard_error
     assert not unnamed(str(seen), one.row, f"{one.count} of {paths}", "2.3 %")
     assert "WithinJointLimits" in seen._repr_html_()
-
-
-def test_between_nodes_is_told():
-    plan = vp.solve(two_links(FAMILIES["velocities"], steps=12, dt=0.08))
-    assert about(plan.warnings, "constraints between nodes")
 
 
 def test_a_motion_that_leaves_the_nodes_tells_nothing_of_what_is_between_them():
@@ -606,39 +542,6 @@ def test_verification_tells_what_the_continuous_robot_violates():
     assert "limit of joint" in speed.where
 
 
-def test_verification_counts_the_first_step():
-    """Lines that push and brake within the first step; against an integration by SciPy."""
-    robot = vp.planar_chain(1)
-    model, data = robot.model, robot.model.createData()
-    model.gravity.setZero()
-    nodes = np.array([[20.0], [-20.0], [0.0], [0.0]])
-    limits = vp.WithinVelocityLimits(robot, (-100.0, 0.1))
-    free, limited = (
-        vp.OptimalControlProblem(
-            vp.Scene(robot, damping=0.1, gravity=False),
-            vp.ControlCost(1.0),
-            [0.0],
-            [0.0],
-            dt=0.1,
-            steps=3,
-            controls="linear",
-            constraints=constraints,
-        )
-        for constraints in ([], [limits])
-    )
-    # Without iterations and constraints, the plan has the given controls.
-    plan = replace(vp.solve(free, nodes, max_iterations=0, check=False), problem=limited)
-    (speed,) = plan.verify(tolerance=1e-8).constraints
-
-    def rate(t, x):
-        torque = np.array([20.0 - 400.0 * t])
-        return np.append(x[1:], pin.aba(model, data, x[:1], x[1:], torque - 0.1 * x[1:]))
-
-    fine = solve_ivp(rate, (0.0, 0.1), np.zeros(2), "DOP853", rtol=1e-11, atol=1e-12, max_step=1e-3).y[1]
-    assert fine.max() - 0.1 > 0.1 > fine[-1]
-    assert speed.open_loop == pytest.approx(fine.max() - 0.1, rel=1e-3)
-
-
 def test_a_motion_with_feedback_that_runs_away_is_no_small_violation():
     kept = ViolationOnRobot("one", "m", 0.0, 0.1, 0.2, "")
     lost = ViolationOnRobot("other", "m", 0.0, 0.1, np.nan, "")
@@ -662,19 +565,3 @@ def test_linear_algebra_has_one_thread_within_constraints():
         assert threads() == before
     assert len(seen) > 0
     assert all(each == {1} for each in seen)
-
-
-def test_linear_algebra_has_one_thread_until_the_last_of_several_searches_ends():
-    """Searches of one process, side by side: the first to end does not restore what the others need."""
-
-    def threads():
-        return {item["num_threads"] for item in threadpool_info() if item["user_api"] == "blas"}
-
-    with threadpool_limits(limits=2, user_api="blas"):
-        before, first, second = threads(), ExitStack(), ExitStack()
-        first.enter_context(one_thread())
-        second.enter_context(one_thread())
-        first.close()
-        assert threads() == {1}
-        second.close()
-        assert threads() == before

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 from chromium import commands, picture, seek, visit
-from refusals import naming, refused
+from refusals import refused
 from test_replay_marks import assert_no_errors, names, placements, pose, vertices
 
 import varpin as vp
 from varpin import replay
-from varpin.show.replay.surroundings import regions
+from varpin.show.replay.annotations import regions
 
 CAPSULES = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05), "joint2": ([0, 0, 0], [1, 0, 0], 0.05)}
 
@@ -155,17 +155,6 @@ def test_constraints_can_be_left_out(plan, crank, tmp_path):
         )
     with refused(vp.InputError, "constraints", "'all'"):
         replay(robot, plan, marks=vp.Marks(constraints="all"), html=tmp_path / "word.html")
-
-
-def test_what_no_viewer_draws_is_left_out_with_a_word(plan, tmp_path, caplog):
-    problem = plan.problem
-    robot = problem.scene.robot
-    huge = vp.OptimalControlProblem(
-        problem.scene, vp.ControlCost(1.0), [0.3, 0.2], np.zeros(2), dt=0.05, steps=2,
-        constraints=[vp.KeepInSphere(robot, "tip", [0.0, 0.0, 0.0], 1e20)],
-    )  # fmt: skip
-    replay(robot, [[0.3, 0.2]], dt=1.0, marks=vp.Marks(constraints=huge), html=tmp_path / "huge.html")
-    assert naming(caplog.messages, "'tip'")
 
 
 def test_what_moves_is_drawn_where_it_is():

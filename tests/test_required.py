@@ -117,9 +117,6 @@ def test_cost_on_the_whole_robot_keeps_fingers_together(tmp_path):
     ("text", "integrator"),
     [
         ('type = "gauss"\nstages = 3\nkick = "split"', vp.Gauss(stages=3, kick="split")),
-        ('type = "explicit_euler"', vp.ExplicitEuler()),
-        ('type = "semi_implicit_euler"', vp.SemiImplicitEuler()),
-        ('type = "runge_kutta_4"', vp.RungeKutta4()),
         ('type = "midpoint"\nalpha = 0.3\nkick = "split"', vp.Midpoint(alpha=0.3, kick="split")),
     ],
 )

@@ -6,7 +6,6 @@ import pytest
 from refusals import refused
 
 import varpin as vp
-from varpin.cli import main
 from varpin.model.robot import geometry
 
 PLACE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.5, 1.1), np.array([0.4, -2.0, 0.7]))
@@ -72,15 +71,6 @@ class TestPlanar:
         own, _ = mass_and_gravity(arm, q[3:])
         np.testing.assert_allclose(M[3:, 3:], own, rtol=0, atol=1e-10)
 
-    def test_the_base_has_its_link_s_mass(self):
-        robot = vp.load_robot("ur5", base="planar")
-        fixed = pin.buildModelFromUrdf(str(robot.urdf))
-        assert fixed.inertias[0].mass > 0.0
-        q = RNG.normal(size=9)
-        M, _ = mass_and_gravity(robot, q)
-        total = sum(inertia.mass for inertia in fixed.inertias)
-        np.testing.assert_allclose(np.diag(M)[:2], total, rtol=1e-12)
-
     def test_with_mimic_joints_payload_and_lock(self):
         load = vp.Payload("panda_hand", 1.5)
         options = {"lock": {"panda_joint7": 0.8}, "payload": load}
@@ -112,21 +102,6 @@ class TestArmature:
             own = vp.lagrangian_jet(vp.Scene(robot), q, np.zeros(6)).Lvv
             np.testing.assert_allclose(own, M + np.diag(added), rtol=0, atol=1e-12)
             np.testing.assert_allclose(mass_and_gravity(robot, q)[0], own, rtol=0, atol=1e-10)
-
-    def test_joints_that_are_not_named_keep_theirs(self):
-        plain = vp.load_robot("talos_arm")
-        first = plain.joint_names[0]
-        own = vp.load_robot("talos_arm", armature={first: 7.0})
-        assert plain.tree.armature[1:].any()
-        np.testing.assert_array_equal(own.tree.armature, [7.0, *plain.tree.armature[1:]])
-
-    def test_what_is_refused(self):
-        with refused(vp.UnknownJoint, "elbow_joint"):
-            vp.load_robot("ur5", armature={"elbow": 1.0})
-        with refused(vp.InputError, "'elbow_joint'", "0"):
-            vp.load_robot("ur5", armature={"elbow_joint": -1.0})
-        with refused(vp.InputError, "finite"):
-            vp.load_robot("ur5", armature=np.nan)
 
 
 LINKS = """
@@ -201,10 +176,6 @@ class TestMeshInertias:
         with refused(vp.InputError, "density"):
             vp.load_robot(written(tmp_path), inertia="meshes", density=0.0)
 
-    def test_a_mesh_with_a_gap(self, tmp_path):
-        with refused(vp.RobotError, "gaps"):
-            vp.load_robot(written(tmp_path, faces=FACES[2:]), inertia="meshes")
-
 
 class TestElsewhere:
     def test_scene_files(self, tmp_path):
@@ -230,22 +201,3 @@ class TestElsewhere:
         path.write_text(text.replace("BASE", '"round"'))
         with refused(vp.SceneFileError, "robot.base"):
             vp.load_scene(path)
-
-    def test_on_the_command_line(self, tmp_path):
-        out = tmp_path / "fall.npz"
-        words = [
-            "simulate",
-            "ur5",
-            "--base",
-            "planar",
-            "--armature",
-            "elbow_joint=0.4",
-            "--steps",
-            "3",
-            "--save",
-            str(out),
-        ]
-        assert main(words) == 0
-        motion = vp.Trajectory.load(out)
-        assert motion.joint_names[:3] == ("base_x", "base_y", "base_turn")
-        assert motion.scene_values["armature"][5] == 0.4

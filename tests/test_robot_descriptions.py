@@ -95,12 +95,6 @@ def test_robots_that_walk_are_refused(cache):
         vp.load_robot("walker_description")
 
 
-def test_names_that_it_does_not_know(cache):
-    with refused(vp.RobotNotFound, "one_description") as info:
-        vp.load_robot("ones_description")
-    assert "pip install" not in str(info.value)
-
-
 def test_without_the_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "robot_descriptions", None)
     with refused(vp.MissingDependency, "'iiwa14_description'", "robot_descriptions", "varpin[descriptions]"):

@@ -1,6 +1,5 @@
 """Steps that the guards took in parts: what a motion keeps of the parts, and the derivatives of exactly these."""
 
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +9,6 @@ from refusals import refused
 import varpin as vp
 from varpin.core import Steps
 from varpin.signals.commands import open_loop
-from varpin.trajectory import chained
 
 WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 
@@ -147,28 +145,6 @@ def test_second_derivatives_are_those_of_the_parts_taken(name, integrator, seed)
         ]
     )
     assert np.abs(given - expected).max() < 1e-7 * np.abs(expected).max()
-
-
-def test_linearizations_do_not_ask_the_guards():
-    scene, motion = moving("finger", vp.Midpoint(), 1)
-    own = vp.linearize(scene, motion)
-    for guard in (None, vp.Guard(max_halvings=0), vp.Guard(energy_balance=1e-6)):
-        other = vp.linearize(scene, motion, integrator=vp.Midpoint(guard=guard))
-        np.testing.assert_array_equal(other.A, own.A)
-
-
-def test_of_a_record_that_comes_back_the_linearization_is_the_same(tmp_path):
-    """Saved, pickled, in parts and put together again: to the last bit."""
-    scene, motion = moving("finger", vp.Gauss(2), 1)
-    own = vp.linearize(scene, motion)
-    parts = [motion.part(*ends) for ends in ((0, 1), (1, 4), (4, 4), (4, 8))]
-    loaded = vp.Trajectory.load(motion.save(tmp_path / "motion.npz"))
-    assert loaded.statistics.halvings.dtype == np.uint8
-    for again in (loaded, pickle.loads(pickle.dumps(motion)), chained(parts)):
-        np.testing.assert_array_equal(again.statistics.halvings, motion.statistics.halvings)
-        np.testing.assert_array_equal(vp.linearize(scene, again).A, own.A)
-    A = np.concatenate([vp.linearize(scene, part).A for part in parts])
-    np.testing.assert_array_equal(A, own.A)
 
 
 def test_parts_are_kept_however_a_motion_is_made():

@@ -120,27 +120,6 @@ def test_steps_in_parts_keep_the_order(stages, balance):
     assert np.log2(errors[0] / errors[1]) > 2 * stages - 0.5, errors
 
 
-def test_held_controls_have_no_ramp():
-    scene = stiff_scene()
-    motion = vp.simulate(scene, CHAIN_Q, CHAIN_V, controls=np.zeros(3), integrator=vp.Gauss(2), **SMALL)
-    assert vp.linearize(scene, motion).ramp is None
-
-
-def test_a_tolerance_is_met_at_high_order():
-    scene, (q, v) = vp.Scene(vp.planar_chain(3)), (CHAIN_Q, CHAIN_V)
-    exact = vp.simulate(scene, q, v, dt=0.0025, steps=200, controls=vp.OpenLoop(push), integrator=vp.Gauss(5)).q[-1]
-    motion = vp.simulate(scene, q, v, duration=0.5, tolerance=1e-9, controls=vp.OpenLoop(push))
-    assert np.abs(motion.q[-1] - exact).max() < 1e-9
-    assert motion.steps < 1000  # thousands of times as many at second order
-    u = np.array([push(t) for t in np.linspace(0.0, 0.5, 6)])
-    lines = vp.simulate(scene, q, v, duration=0.5, tolerance=1e-9, controls=vp.FirstOrderHold(u))
-    times = np.linspace(0.0, 0.5, lines.steps + 1)
-    along = np.column_stack([np.interp(times, np.linspace(0.0, 0.5, 6), column) for column in u.T])
-    fine = vp.FirstOrderHold(along).refined(4)
-    exact = vp.simulate(scene, q, v, duration=0.5, steps=4 * lines.steps, controls=fine, integrator=vp.Gauss(4)).q[-1]
-    assert np.abs(lines.q[-1] - exact).max() < 1e-9
-
-
 def test_what_is_refused():
     scene = stiff_scene()
     with refused(vp.InputError, "node", "(3,)"):

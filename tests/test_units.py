@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 from mechanisms import joint, link, slider, write_urdf
-from refusals import refused
 
 import varpin as vp
 from varpin.model import joint_unit
@@ -41,12 +38,3 @@ def test_units_of_limits(crane):
     assert bound(crane, vp.WithinVelocityLimits(crane, (-1.0, 1.0))).unit == "rad/s or m/s"
     # Only joints with a limit count.
     assert bound(crane, vp.WithinJointLimits(crane, (-np.inf, [np.inf, 1.0]))).unit == "m"
-
-
-def test_trajectories_of_another_scene():
-    chain = vp.planar_chain(2)
-    motion = vp.simulate(vp.Scene(chain), [0.3, 0.1], [0.0, 0.0], dt=0.01, steps=5)
-    motion = dataclasses.replace(motion, scene_values={})
-    with refused(vp.InputError, "rad/s. Give the scene") as info:
-        vp.linearize(vp.Scene(chain, gravity=[0.0, 0.0, -1.6]), motion)
-    assert "m/s" not in str(info.value)

@@ -9,14 +9,14 @@ import threading
 import numpy as np
 import pinocchio as pin
 import pytest
-from mechanisms import INERTIAL, arm, joint, link, mimic, random_tree, write_urdf
+from mechanisms import INERTIAL, arm, joint, link, mimic, write_urdf
 from refusals import naming, refused, unnamed
 
 import varpin as vp
 from varpin.model import example_robot_data, geometry, readable_geometry
 from varpin.model.urdf import read_urdf
 
-ROBOTS = example_robot_data.locate(example_robot_data.FIXED_BASE["ur5"]).parents[2]
+ROBOTS = example_robot_data.robots_dir()
 PUBLISHED = sorted(str(path.relative_to(ROBOTS)) for path in ROBOTS.rglob("*.urdf"))
 BALL = '<visual><geometry><sphere radius="0.1"/></geometry></visual>'
 HEAVY = '<inertial><origin xyz="0.1 0 0.2"/><mass value="5"/></inertial>'
@@ -111,17 +111,8 @@ ODD = {
         "",
     ),
     "a byte order mark": (lambda text: "\ufeff" + text, ""),
-    "utf-16": (lambda text: text.encode("utf-16"), ""),
     "dos lines": (lambda text: text.replace("\n", "\r\n"), ""),
-    "mac lines": (lambda text: text.replace("\n", "\r"), ""),
     "blank lines first": (lambda text: "\n \n" + text, ""),
-    "no declaration": (lambda text: text.partition("\n")[2], ""),
-    "entities": (
-        lambda text: '<!DOCTYPE robot [<!ENTITY m "1.3">]>\n' + text.partition("\n")[2].replace('"1.3"', '"&m;"'),
-        "",
-    ),
-    "an encoding that it is not in": (lambda text: text.replace("?>", ' encoding="utf-16"?>', 1), ""),
-    "an unknown encoding": (lambda text: text.replace("?>", ' encoding="klingon"?>', 1), ""),
     "no inertia": (lambda text: text.replace(INERTIAL, HEAVY, 1), ("[l1]", "inertia")),
     "no mass": (lambda text: text.replace('<mass value="1.3"/>', "", 1), ("[l1]", "mass")),
     "a mass that is none": (lambda text: text.replace('"1.3"', '"1.3 kg"', 1), ("[l1]", "mass", "[1.3 kg]")),
@@ -132,8 +123,6 @@ ODD = {
         ("[l1]", "[0.02 0.05]"),
     ),
     "a number with blanks": (lambda text: text.replace('"1.3"', '" 1.3 "'), ""),
-    "an ampersand": (lambda text: text.replace("</robot>", "<a>b & c</a></robot>"), ""),
-    "something behind it": (lambda text: text + "<more/>", ""),
 }
 
 
@@ -262,12 +251,6 @@ class TestLimits:
         assert len(told) == bool(facts)
         assert naming(told, (NONE, "'j1'") if NONE in facts else facts) == list(told)
 
-    @pytest.mark.parametrize(("upper", "told"), [("350", 1), ("12.5", 0)])
-    def test_of_a_slider_that_look_like_millimetres(self, tmp_path, caplog, upper, told):
-        path = arm(tmp_path, kind="prismatic")
-        vp.load_robot(written(tmp_path, path.read_text().replace('upper="1"', f'upper="{upper}"')))
-        assert len(naming(caplog.messages, "slider", "'j1'", "350 m", "millimetres")) == told == len(caplog.messages)
-
     def test_on_a_continuous_joint_are_told(self, tmp_path, caplog):
         assert vp.load_robot(arm(tmp_path, kind="continuous")).unbounded.all()
         assert naming(caplog.messages, "continuous", "'j1'")
@@ -344,13 +327,6 @@ class TestFaultyNumbers:
         text = "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 123\n"
         with refused(vp.RobotError, "odd.urdf", "Git LFS", "git lfs pull"):
             vp.load_robot(written(tmp_path, text))
-
-    def test_entities_that_expand_without_bound(self, tmp_path):
-        laughs = "".join(f'<!ENTITY e{k} "{f"&e{k - 1};" * 10}">' for k in range(1, 12))
-        path = tmp_path / "a.urdf"
-        path.write_text(f'<!DOCTYPE robot [<!ENTITY e0 "ha">{laughs}]><robot name="a"><link name="&e11;"/></robot>')
-        with pytest.raises(vp.RobotError):
-            vp.load_robot(path)
 
     def test_masses_beyond_floating_point(self, tmp_path):
         heavy = INERTIAL.replace('ixx="0.02"', 'ixx="1e308"').replace('iyy="0.03"', 'iyy="1e308"')
@@ -447,24 +423,9 @@ class TestMany:
         assert "still here" in capfd.readouterr().err
 
 
-class TestDamagedModels:
-    @pytest.mark.parametrize(
-        ("change", "facts"),
-        [
-            (lambda model: model.parents.__setitem__(2, 77), "parent"),
-            (lambda model: setattr(model, "armature", np.zeros(1)), ("armature", "1", "3")),
-            (lambda model: setattr(model, "lowerPositionLimit", np.zeros(9)), ("lowerPositionLimit", "9")),
-            (lambda model: model.names.append("more"), ("names", "5", "4")),
-            (lambda model: model.inertias.append(pin.Inertia.Zero()), ("inertias", "5")),
-            (lambda model: setattr(model.frames[1], "parentJoint", 99), "frame"),
-        ],
-    )
-    def test_whose_parts_do_not_fit(self, change, facts):
-        model = random_tree(0, 3, branching=False)
-        model.addFrame(pin.Frame("tool", 1, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
-        while any(joint.nq != 1 for joint in list(model.joints)[1:]):
-            model = random_tree(int(model.name[4:]) + 1, 3, branching=False)
-            model.addFrame(pin.Frame("tool", 1, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
-        change(model)
-        with refused(vp.RobotError, facts):
-            vp.load_robot(model)
+@pytest.mark.parametrize(("part", "facts"), [("armature", ("1", "3")), ("lowerPositionLimit", ("1", "3"))])
+def test_models_whose_parts_do_not_fit_are_refused(part, facts):
+    model = vp.planar_chain(3).model.copy()
+    setattr(model, part, np.zeros(1))
+    with refused(vp.RobotError, part, *facts):
+        vp.load_robot(model)

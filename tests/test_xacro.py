@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 import sys
 
@@ -116,14 +115,6 @@ def test_bad_files_give_one_error(workspace, change, facts):
     # Each thing is said once, and none in the names of Python's classes.
     assert not re.search(r"<class|Error:|Exception", str(caught.value))
     assert str(caught.value).count("No such file") <= 1
-
-
-def test_warnings_of_xacro_are_logged(workspace, caplog, capfd):
-    workspace.write_text(workspace.read_text().replace("</robot>", '<xacro:include filename="more_*.xacro"/></robot>'))
-    with caplog.at_level(logging.WARNING):
-        vp.load_robot(workspace)
-    assert "more_*.xacro" in caplog.text
-    assert "more_" not in capfd.readouterr().err
 
 
 def test_without_the_package(tmp_path, monkeypatch):

@@ -157,11 +157,11 @@ if TYPE_CHECKING:
     from varpin.linearization import propagate_moments as propagate_moments
     from varpin.linearization import second_order as second_order
     from varpin.model.clearance import Obstacle as Obstacle
+    from varpin.show.inspection import FrameReport as FrameReport
+    from varpin.show.inspection import JointReport as JointReport
+    from varpin.show.inspection import LinkReport as LinkReport
+    from varpin.show.inspection import RobotReport as RobotReport
     from varpin.show.inspection import inspect_robot as inspect_robot
-    from varpin.show.inspection_report import FrameReport as FrameReport
-    from varpin.show.inspection_report import JointReport as JointReport
-    from varpin.show.inspection_report import LinkReport as LinkReport
-    from varpin.show.inspection_report import RobotReport as RobotReport
     from varpin.show.replay.live import LiveView as LiveView
     from varpin.show.replay.motion import replay as replay
     from varpin.study.advice import Advice as Advice
@@ -214,8 +214,7 @@ _LATE: dict[str, tuple[str, ...]] = {
     ),
     "varpin.model.clearance": ("Obstacle",),
     "varpin.ensemble": ("Ensemble", "EnsembleInterrupted", "EnsembleStatistics", "PathFailure", "simulate_ensemble"),
-    "varpin.show.inspection": ("inspect_robot",),
-    "varpin.show.inspection_report": ("FrameReport", "JointReport", "LinkReport", "RobotReport"),
+    "varpin.show.inspection": ("FrameReport", "JointReport", "LinkReport", "RobotReport", "inspect_robot"),
     "varpin.show.replay.live": ("LiveView",),
     "varpin.show.replay.motion": ("replay",),
     "varpin.linearization": ("Curvature", "Linearization", "Moments", "linearize", "propagate_moments", "second_order"),

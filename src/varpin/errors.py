@@ -30,7 +30,7 @@ class RobotError(VarpinError, ValueError):
 
 def _meant(name: str, known: tuple[str, ...]) -> tuple[list[str], str]:
     """The known names similar to ``name``, and a hint with them; both are empty if there are none."""
-    matches = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+    matches = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
     return matches, f"did you mean {' or '.join(map(repr, matches))}? " if matches else ""
 
 

@@ -33,9 +33,8 @@ class Marks:
             planned path of each traced frame as beads. The end of the horizon if left out; 0 to show no plans.
         torques: Colour each link by the torque of the joint that moves it, grey for none, red at its limit: ``True``
             for the controls of the trajectory, one for each joint; or the torques (N, n) themselves [N m or N], of N
-            steps spread evenly over the motion's time. The limits are the control limits of a plan, where
-            ``torques`` is True, and the robot's effort limits where it has none; a joint without one is red at its own
-            largest torque.
+            steps spread evenly over the motion's time. The limits are the robot's effort limits; a joint without one is
+            red at its own largest torque.
         constraints: Draw the constraints of the mechanism, and the obstacles, regions and goals of a plan. ``True``
             takes them from a plan or a controller's run, ``False`` draws none. A trajectory or an array does not
             contain them: give its scene or its problem.

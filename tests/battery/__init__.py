@@ -1,6 +1,5 @@
 """Extreme scenes, each run with every integrator and judged by independent checks: what docs/limits.md reports."""
 
-from battery.running import measures as measures
 from battery.running import run as run
 from battery.scenes import TRIALS as TRIALS
 from battery.scenes import trials_on as trials_on

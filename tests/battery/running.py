@@ -7,19 +7,17 @@ import time
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 
-from battery.exact import before_step, exact_motion, period_error
+from battery.exact import exact_motion, period_error
 from battery.scenes import TRIALS, trials_on
 from battery.trial import Outcome, Setup, Trial
-from varpin.errors import VarpinError
 from varpin.integrators import Integrator
 from varpin.model import Robot
 from varpin.study import checks
 from varpin.study.checks import LEVELS, condition, findings
-from varpin.study.exact import Exact
+from varpin.study.exact import Exact, before_step
 from varpin.study.extremes import INTEGRATORS, Cell, Kind, Record, attempt, judge
 from varpin.study.record import Progress, collect
 from varpin.support.checks import positive
-from varpin.trajectory import Trajectory
 
 # A motion gets this long, and the plain battery half a minute at most for one [s].
 _PATIENCE, _DEEP_PATIENCE = 20.0, 900.0
@@ -65,12 +63,6 @@ def run(
     return collect(Record((), name), cells(), len(trials) * len(members), progress)
 
 
-def measures(setup: Setup, integrator: Integrator, trajectory: Trajectory, exact: Exact | None) -> dict[str, float]:
-    """Every check of a motion by its name in :class:`Cell`: those of ``check_robot``, and from nodes all over it."""
-    own = checks.measures(setup.scene, integrator, trajectory, exact)
-    return own | {"period": period_error(setup.scene, integrator, trajectory)}
-
-
 class Bench:
     """A trial with what all integrators share of it: its setup and its exact motion."""
 
@@ -107,16 +99,19 @@ class Bench:
             patience, setup.scene, setup.q0, setup.v0, dt=trial.dt, steps=trial.steps,
             controls=setup.controls, increments=setup.increments, integrator=integrator,
         )  # fmt: skip
-        found = measures(setup, integrator, trajectory, self._exact_motion(trial, integrator))
-        kind, said, wrong = judge(trajectory, error, findings(found, integrator, condition(setup.scene, setup.q0)))
+        exact, scene = self._exact_motion(trial, integrator), setup.scene
+        found, period = (
+            checks.measures(scene, integrator, trajectory, exact),
+            period_error(scene, integrator, trajectory),
+        )
+        late = (f"period {period:.2g} (wrong from 1)",) if period >= 1.0 else ()
+        wrong = (*findings(found, integrator, condition(scene, setup.q0)), *late)
+        kind, said, wrong = judge(trajectory, error, wrong)
         return Outcome(kind, found, said, wrong, trajectory.steps)
 
     def _exact_motion(self, trial: Trial, integrator: Integrator) -> Exact | None:
         """The exact motion, computed once; None where even that cannot be integrated."""
         left = 1.0 if self._setup.increments is None else before_step(integrator)
         if left not in self._exact:
-            try:
-                self._exact[left] = exact_motion(self._setup, trial.dt, trial.steps, trial.window, left=left)
-            except VarpinError:
-                self._exact[left] = None
+            self._exact[left] = exact_motion(self._setup, trial.dt, trial.steps, trial.window, left=left)
         return self._exact[left]

@@ -9,7 +9,6 @@ cubics through the steps instead, which take hardly any time.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,8 +23,6 @@ from varpin.trajectory import Trajectory
 
 # Parts of a step.
 _PARTS = 8
-# Greatest number of instants of a constraint in a step.
-MOST_INSTANTS = _PARTS - 1
 # Where the rows of a controller's ticks are.
 _MIDDLE = 0.5
 # Violation of the start from which on a row cannot hold in the first step.
@@ -38,7 +35,7 @@ _NEAR = 1e-3
 # range with linear controls, which lead around nodes.
 _BETWEEN, _SHARE = 1e-6, 1e-3
 # Marks a row that is not enforced, in the place of its moment.
-UNUSED = -1.0
+_UNUSED = -1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +82,6 @@ def enforced(problem: OptimalControlProblem, instants: Instants) -> OptimalContr
     # The dataclass is frozen: attributes are set in its dictionary.
     vars(made).update(vars(problem) | {"bound_constraints": tuple(found)})
     return made
-
-
-def in_force(problem: OptimalControlProblem, instants: Instants) -> list[Mask]:
-    """Which rows at ``instants`` are enforced (K, rows), for each constraint with such rows."""
-    return [moments >= 0.0 for moments in _of_constraints(problem, instants).values()]
 
 
 def _of_constraints(problem: OptimalControlProblem, instants: Instants) -> dict[int, Floats]:
@@ -185,25 +177,21 @@ def middles(problem: OptimalControlProblem) -> Instants:
 def followed(problem: OptimalControlProblem, instants: Instants, motion: Trajectory, backoff: list[Floats]) -> Instants:
     """The instants, and those at peaks of a motion that violates constraints between its nodes; itself if none does.
 
-    Args:
-        problem: The problem, without rows between nodes.
-        instants: Those so far.
-        motion: The motion.
-        backoff: Margins of all constraints at the nodes (K, rows).
+    ``backoff`` are the margins (K, rows) of all constraints at the nodes.
     """
     if not any(watched(problem)) or not (problem.linear or problem.between_nodes):
         return instants
     rows, moments, violated = [], [], False
     former = _of_constraints(problem, instants)
     for i, near in _seen(problem, motion).items():
-        scale, peaks = problem.bound_constraints[i].scale, _peaks(near)
-        beyond = np.where(peaks.there, peaks.values + backoff[i][:, None], -np.inf)
+        scale, (places, values, there) = problem.bound_constraints[i].scale, _peaks(near)
+        beyond = np.where(there, values + backoff[i][:, None], -np.inf)
         violated |= bool((beyond > (_BETWEEN if problem.between_nodes else _SHARE * scale)).any())
         wanted = beyond > -_NEAR * scale
         known = instants.of(i)[:, 0]
         old = former.get(i, np.zeros((0, near.shape[2])))
         for step in np.union1d(np.flatnonzero(wanted.any(axis=(1, 2))), known):
-            new = _with_places(old[known == step], np.where(wanted[step], peaks.places[step], UNUSED))
+            new = _with_places(old[known == step], np.where(wanted[step], places[step], _UNUSED))
             rows += [(i, int(step), number) for number in range(len(new))]
             moments.append(new.ravel())
     if not violated:
@@ -245,24 +233,19 @@ def _with_places(moments: Floats, places: Floats) -> Floats:
             if any(own[row] >= 0.0 and abs(own[row] - place) <= _SAME for own in found):
                 continue
             own = next((own for own in found if own[row] < 0.0), None)
-            if own is None and len(found) < MOST_INSTANTS:
-                own = np.full(places.shape[1], UNUSED)
+            if own is None and len(found) < _PARTS - 1:
+                own = np.full(places.shape[1], _UNUSED)
                 found.append(own)
             if own is not None:
                 own[row] = place
     return np.array(found)
 
 
-class _Peaks(NamedTuple):
-    """Peaks within steps, each of the parabola through the ends of two successive parts."""
+def _peaks(near: Floats) -> tuple[Floats, Floats, Mask]:
+    """The peaks of values (N, parts + 1, rows) at the ends of parts: places (N, parts - 1, rows), values, and which.
 
-    places: Floats  # (N, parts - 1, rows) in a step of unit length
-    values: Floats
-    there: Mask  # which of the parabolas have one within the step, no closer to another's middle
-
-
-def _peaks(near: Floats) -> _Peaks:
-    """The peaks of values (N, parts + 1, rows) at the ends of parts."""
+    Each is of the parabola through the ends of two successive parts, and there if no closer to another's middle.
+    """
     before, here, after = near[:, :-2], near[:, 1:-1], near[:, 2:]
     # The first and the last one go on to the end of the step.
     reach = np.full((2, _PARTS - 1, 1), 0.5)
@@ -274,4 +257,4 @@ def _peaks(near: Floats) -> _Peaks:
         x = np.where(there, x, 0.0)
         values = np.where(there, here + 0.25 * x * (after - before), here)
     places = (np.arange(1, _PARTS)[:, None] + x) / _PARTS
-    return _Peaks(places, values, there)
+    return places, values, there

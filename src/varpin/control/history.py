@@ -136,7 +136,6 @@ class Refined:
         iterations: Iterations of the search.
         status: How the search ended.
         seconds: Time of the search and the verification [s].
-        share: Share in the time of all steps tried.
         excess: Excess of the true cost over the optimum of finer controls, relative to the latter: an estimate
             from the plan with half the step. Infinite where it is not known.
         violation: Largest violation of a constraint on the continuous system with feedback, relative to the
@@ -152,17 +151,16 @@ class Refined:
     iterations: int
     status: Status
     seconds: float
-    share: float = 1.0
     excess: float = np.inf
     violation: float = 0.0
 
-    HEADER = "      dt  steps         cost    true cost       loss     excess  violation  iterations   time"
+    HEADER = "      dt  steps         cost    true cost       loss     excess  violation  iterations  time [s]"
 
     def __str__(self) -> str:
         above = part(self.excess) if np.isfinite(self.excess) else ""
         return (
             f"{self.dt:8.3g} {self.steps:6d} {self.cost:12.6e} {self.true_cost:12.6e} {part(self.loss):>10} "
-            f"{above:>10} {self.violation:10.1e} {self.iterations:11d} {100.0 * self.share:4.0f} %"
+            f"{above:>10} {self.violation:10.1e} {self.iterations:11d} {self.seconds:9.2g}"
         )
 
 

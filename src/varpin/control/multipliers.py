@@ -136,33 +136,23 @@ def at_nodes(problem: OptimalControlProblem, known: Multipliers, values: Floats)
     return split(enforced(problem, known.between).bound_constraints, values)[: len(problem.bound_constraints)]
 
 
-def reports_of(
-    problem: OptimalControlProblem, motion: Trajectory, values: list[Floats], backoff: list[Floats]
-) -> tuple[ConstraintReport, ...]:
-    """Reports about each bound constraint of a problem, with multipliers ``values`` and margins (K, rows)."""
-    found = []
-    for item, margin, multipliers in zip(problem.bound_constraints, backoff, values, strict=True):
-        c = item.value(motion.q, motion.v, problem.control_rows(motion)) + margin
-        given = problem.label_of(item.source), item.rows, item.unit, item.times, c, multipliers
-        found.append(ConstraintReport(*given, item.source.equality))
-    return tuple(found)
-
-
 def reports(
     problem: OptimalControlProblem, motion: Trajectory, multipliers: Multipliers
 ) -> tuple[ConstraintReport, ...]:
     """Reports about each constraint of a problem for a motion on its grid, with their rows between nodes."""
-    between = multipliers.between
-    whole = enforced(problem, between)
-    parts = (split(whole.bound_constraints, array) for array in (multipliers.values, multipliers.backoff))
-    found = list(reports_of(whole, motion, *parts))
+    between, u = multipliers.between, problem.control_rows(motion)
+    whole, found = enforced(problem, between).bound_constraints, list[ConstraintReport]()
+    pulls, margins = (split(whole, array) for array in (multipliers.values, multipliers.backoff))
+    for item, pull, margin in zip(whole, pulls, margins, strict=True):
+        given = problem.label_of(item.source), item.rows, item.unit, item.times
+        c = item.value(motion.q, motion.v, u) + margin
+        found.append(ConstraintReport(*given, c, pull, item.source.equality))
     count = len(problem.bound_constraints)
     for i, more in zip(between.constraints, found[count:], strict=True):
-        of_nodes = found[i]
-        order = np.argsort(np.concatenate([of_nodes.t, more.t]), kind="stable")
-        t, c, lam = (
-            np.concatenate([getattr(of_nodes, name), getattr(more, name)])[order]
+        order = np.argsort(np.concatenate([found[i].t, more.t]), kind="stable")
+        t, c, pull = (
+            np.concatenate([getattr(found[i], name), getattr(more, name)])[order]
             for name in ("t", "values", "multipliers")
         )
-        found[i] = replace(of_nodes, t=t, values=c, multipliers=lam)
+        found[i] = replace(found[i], t=t, values=c, multipliers=pull)
     return tuple(found[:count])

@@ -28,19 +28,12 @@ class Parts(Frozen):
     """Steps that are each integrated in equal parts, from the node at their begin.
 
     Controls are (m,) of a step, or where they are linear those at its begin and its end (2m,).
-
-    Attributes:
-        scene: The scene, without noise.
-        integrator: The integrator of the parts.
-        dt: Length of a step [s].
-        count: Number of parts of a step.
-        linear: Whether controls are linear over a step.
     """
 
-    scene: Scene
+    scene: Scene  # without noise
     integrator: Integrator
-    dt: float
-    count: int
+    dt: float  # length of a step [s]
+    count: int  # parts of a step
     linear: bool
 
     def controls(self, u: Floats, steps: Integers) -> Floats:
@@ -48,13 +41,7 @@ class Parts(Frozen):
         return np.concatenate([u[steps], u[steps + 1]], axis=1) if self.linear else u[steps]
 
     def states(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats] | None:
-        """The q and v (K, count + 1, n) at the ends of the parts of K steps; None where one fails.
-
-        Args:
-            q: Configurations at their begin (K, n).
-            v: Velocities at their begin (K, n).
-            u: Their controls.
-        """
+        """The q and v (K, count + 1, n) at the ends of the parts of K steps from q and v (K, n); None if one fails."""
         own, dt = self._commands(u), self.dt / self.count
         try:
             found = self.integrator.motions(self.scene, q.copy(), v.copy(), own, dt)

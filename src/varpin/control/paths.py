@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -23,25 +24,15 @@ from varpin.trajectory import Trajectory
 
 @dataclass(frozen=True, eq=False)
 class Paths(Frozen):
-    """The paths first, ..., last - 1 of a problem under a policy.
-
-    Attributes:
-        problem: The problem.
-        policy: The policy.
-        seeds: One child of the random generator for each path.
-        shared: What the core needs for them; None where only Python evaluates the noise.
-        first: Index of the first path.
-        last: Index after the last path.
-        keep: Number of the largest values of each row of a constraint with a margin to return.
-    """
+    """The paths first, ..., last - 1 of a problem under a policy."""
 
     problem: OptimalControlProblem
     policy: LinearPolicy
-    seeds: Children
-    shared: Shared | None
+    seeds: Children  # one child of the random generator for each path
+    shared: Shared | None  # what the core needs; None where only Python evaluates the noise
     first: int
     last: int
-    keep: int = 0
+    keep: int = 0  # of the largest values of each row of a constraint with a margin
 
     @classmethod
     def of(
@@ -63,19 +54,12 @@ class Paths(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class Found(Frozen):
-    """What C paths have shown.
+    """What C paths have shown; the last two of each constraint with a margin."""
 
-    Attributes:
-        costs: Their costs (C,), NaN where one failed.
-        extremes: The extreme paths to check.
-        counts: Number of paths that violate each constraint with a margin, by its places and rows.
-        largest: The largest values of the same, in no order, (at most keep, K, rows).
-    """
-
-    costs: Floats
-    extremes: Extremes
-    counts: tuple[Integers, ...]
-    largest: tuple[Floats, ...]
+    costs: Floats  # (C,), NaN where one failed
+    extremes: Extremes  # the extreme paths, to check
+    counts: tuple[Integers, ...]  # of paths that violate it, by places and rows
+    largest: tuple[Floats, ...]  # its largest values, in no order, (at most keep, K, rows)
 
 
 def simulated(paths: Paths) -> Found:
@@ -87,13 +71,10 @@ def simulated(paths: Paths) -> Found:
         extremes, stored = part.extremes, part.stored
         q, v, u = stored["q"], stored["v"], stored["u_nodes" if problem.linear else "u"]
     else:
-        try:
+        q = v = np.full((1, problem.steps + 1, problem.scene.robot.dof), np.nan)
+        u = np.full((1, problem.steps + problem.linear, problem.scene.controls), np.nan)
+        with contextlib.suppress(StepFailure, NoiseError):
             motion = path_of(paths)
-        except (StepFailure, NoiseError):
-            shape = 1, problem.steps + 1, problem.scene.robot.dof
-            q, v = np.full(shape, np.nan), np.full(shape, np.nan)
-            u = np.full((1, problem.steps + problem.linear, problem.scene.controls), np.nan)
-        else:
             q, v, u = motion.q[None], motion.v[None], problem.control_rows(motion)[None]
     costs = problem.costs(q, v, u)
     finished = np.isfinite(costs)

@@ -603,7 +603,7 @@ class OptimalControlProblem(Frozen):
         """
         q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
         at, weight = self.samples(q, v, u), self.dt * self.rule[0, 0]
-        found = [weight * self.running.compiled.values(*at).ravel()]
+        found = [weight * self.running.compiled(*at).ravel()]
         found += [weight * (factor * part.value(*at)) for factor, part in self.running.others]
         found += [values.ravel() for values in self.terminal.shares(q[-1:], v[-1:], np.zeros((1, u.shape[1])))]
         if self.rate is not None:

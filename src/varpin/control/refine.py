@@ -16,7 +16,6 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
 from varpin.control.verification import excess, on_robot
 from varpin.errors import VarpinError
-from varpin.simulation.spectrum import rate_at_rest
 from varpin.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
@@ -31,13 +30,12 @@ _LOOKS = 8
 _HALVINGS = 10
 # Greatest violation of a constraint on the continuous system, relative to its range.
 _HOLDS = 0.1 * REPORTED
-# Halvings that have to lower the violation, the loss or the excess by this factor, on steps that resolve dampers and
-# dry friction: whose rate times the step is no more than that. A search that has ended otherwise than with its last
-# iteration gets one of them.
-_PATIENCE, _LOWER, _RESOLVED = 3, 0.9, 2.0
-# Bounds on the factor by which half the step lowers the excess of planned costs over the optimum: of smooth motions on
-# coarse grids (on fine ones it is 0.25), and of controls that reach their limits.
-_FALLS = (0.4, 0.5)
+# Halvings without a better plan before the refinement ends: on steps that do not resolve dampers losses rise at first.
+# From 4 to 6. A search that has ended otherwise than with its last iteration gets one of them.
+_PATIENCE = 4
+# Share of what half the step gains that further halvings gain together: 1/3 of smooth motions on fine grids, 2/3 on
+# coarse ones and 1 of controls that reach their limits.
+_FURTHER = 2.0 / 3.0
 
 Search = Callable[[OptimalControlProblem, Trajectory | None], Solution]
 
@@ -55,23 +53,17 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
     """Plan with the problem's step, then halve it, each time from the plan before, until the loss is small.
 
     A plan whose loss is within the wish, and that keeps to the constraints on the continuous system, is compared with
-    the plan of half the step, which is the next one where that is cheaper by more than the wish.
-
-    Args:
-        problem: The problem with the coarsest step.
-        search: Makes a plan from a motion; interrupted, it returns one with status INTERRUPTED.
-        wish: Greatest allowed :attr:`Verification.closed_loop_loss`, and excess over the optimum.
-        time_left: Returns the time left [s].
+    the plan of half the step, which is the next one where that is cheaper by more than the wish. A ``search`` makes a
+    plan from a motion; interrupted, it returns one with status INTERRUPTED.
     """
     tried: list[Refined] = []
     best: _Best | None = None
     finer: Solution | None = None
     start: Trajectory | None = None
-    least, since = (9, np.inf), 0
     while True:
         began, doing = time.perf_counter(), f"with dt = {problem.dt:g} s"
         try:
-            solution = search(problem, start) if finer is None else finer
+            solution = finer or search(problem, start)
             if solution.status is Status.INTERRUPTED:
                 best = best or _Best((9, 0.0), solution, 0, "")
                 raise KeyboardInterrupt
@@ -100,25 +92,20 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
             rank = kind, value if kind else row.true_cost
             if best is None or rank < best.rank:
                 best = _Best(rank, solution, len(tried) - 1, found.beyond if kind >= 2 else "")
-            finer, spent = None, _spent(tried, time_left())
+            finer, ended = None, _ended(tried, best.chosen, solution, time_left())
             doing = f"with half of dt = {problem.dt:g} s"
             half, fails = _halved(problem)
-            if kind == 0 and not spent:
-                value = _barely_above(tried, wish)
-                if half is not None and not np.isfinite(value):
+            if kind == 0 and time_left() > 0.0:
+                if half is not None:
                     finer = search(half, _motion_of(solution, half))
                     if finer.status is Status.INTERRUPTED:
                         raise KeyboardInterrupt
-                    value = _above(tried, solution, finer)
-                tried[-1] = replace(row, excess=value, seconds=time.perf_counter() - began)
-                if value <= wish or (finer is None and not np.isfinite(value)):
+                    above = _above(tried, solution, finer)
+                    tried[-1] = replace(row, excess=above, seconds=time.perf_counter() - began)
+                if half is None or tried[-1].excess <= wish:
                     return _recorded(solution, wish, tried, len(tried) - 1, "", met=True)
-            if kind < least[0] or (kind == least[0] and value < _LOWER * least[1]):
-                least, since = (kind, value), len(tried) - 1
-            ended = spent or _stuck(problem, solution, tried, since, kind) or fails
-            if ended:
-                return _given_up(best, wish, tried, ended)
-            assert half is not None
+            if ended or half is None:
+                return _given_up(best, wish, tried, ended or fails)
             start, problem = _motion_of(solution, half) if finer is None else None, half
         except VarpinError as error:
             if best is None:
@@ -160,34 +147,18 @@ def _failing(row: Refined, solution: Solution, wish: float) -> tuple[int, float]
     return 0, np.inf
 
 
-def _spent(tried: list[Refined], left: float) -> str:
-    """Why the step may not be halved; empty if it may."""
+def _ended(tried: list[Refined], chosen: int, solution: Solution, left: float) -> str:
+    """Why the step may not be halved, with the best plan so far ``chosen``; empty if it may."""
+    row, without = tried[-1], len(tried) - 1 - chosen
     if left <= 0.0:
-        return f"the time limit came after dt = {tried[-1].dt:g} s"
-    return f"the step has been halved {_HALVINGS} times" if len(tried) > _HALVINGS else ""
-
-
-def _stuck(problem: OptimalControlProblem, solution: Solution, tried: list[Refined], since: int, kind: int) -> str:
-    """Why halving on would gain nothing, as the last gain was ``since``; empty if it may."""
-    status, without = solution.status, len(tried) - 1 - since
-    if not status.converged and without >= (_PATIENCE if status is Status.MAX_ITERATIONS else 1):
-        if status is Status.INFEASIBLE:
-            return f"with dt = {problem.dt:g} s there is no plan within the constraints: {solution.reason}"
-        return f"for {without + 1} steps in a row the searches ended {status.name}"
-    if without < _PATIENCE or problem.dt * rate_at_rest(problem.scene, problem.q0) > _RESOLVED:
+        return f"the time limit came after dt = {row.dt:g} s"
+    if len(tried) > _HALVINGS:
+        return f"the step has been halved {_HALVINGS} times"
+    if without < (_PATIENCE if row.status in (Status.CONVERGED, Status.MAX_ITERATIONS) else 1):
         return ""
-    what = ("excess over finer controls", "loss", "violation", "violation")[kind]
-    return f"the last {_PATIENCE} halvings of the step have not lowered the {what}"
-
-
-def _barely_above(tried: list[Refined], wish: float) -> float:
-    """Excess of the last row, where the halving before has hardly changed the cost; else infinite."""
-    if len(tried) < 2 or not all(row.status.converged for row in tried[-2:]):
-        return np.inf
-    last, gained = tried[-1], tried[-2].cost - tried[-1].cost
-    if abs(gained) > _KNOWN * wish * abs(last.cost):
-        return np.inf
-    return _over_known(tried, excess(last.true_cost, last.cost - max(gained, 0.0)))
+    if row.status is Status.INFEASIBLE:
+        return f"with dt = {row.dt:g} s there is no plan within the constraints: {solution.reason}"
+    return f"{without} halvings of the step have brought no better plan, the last search {row.status.name}"
 
 
 def _above(tried: list[Refined], solution: Solution, finer: Solution) -> float:
@@ -200,12 +171,9 @@ def _above(tried: list[Refined], solution: Solution, finer: Solution) -> float:
     optimum = finer.cost
     if not finer.status.converged and finer.history:
         optimum -= max(finer.history[-1].expected_decrease, 0.0)
-    # Finer controls lower the planned cost further, by a geometric series.
-    gained, falls = tried[-1].cost - optimum, _FALLS[0]
-    if len(tried) > 1 and tried[-2].cost > tried[-1].cost:
-        falls = float(np.clip(gained / (tried[-2].cost - tried[-1].cost), *_FALLS))
+    gained = tried[-1].cost - optimum
     # Where the cost has fallen to a fraction, that says nothing about further falls.
-    further = max(gained, 0.0) * falls / (1.0 - falls) if gained < abs(optimum) else 0.0
+    further = _FURTHER * max(gained, 0.0) if gained < abs(optimum) else 0.0
     return _over_known(tried, excess(tried[-1].true_cost, optimum - further))
 
 
@@ -233,13 +201,11 @@ def _recorded(
     solution: Solution, wish: float, tried: list[Refined], chosen: int, reason: str, *, met: bool = False
 ) -> Solution:
     """The solution with the record of its refinement."""
-    total = sum(row.seconds for row in tried) or 1.0
-    rows = tuple(replace(row, share=row.seconds / total) for row in tried)
     if met:
-        row, compared = rows[chosen], "not compared with finer controls"
+        row, compared = tried[chosen], "not compared with finer controls"
         if np.isfinite(row.excess):
             above = f"about {part(row.excess)} above the optimum of finer controls"
             compared = above if row.excess > 0.0 else "half the step is not cheaper"
         reason = f"dt = {row.dt:g} s loses {part(row.loss)}, within {part(wish)[1:]}; {compared}"
     logger.log(logging.INFO if met else logging.WARNING, "%s: %s", solution.problem.scene.robot.name, reason)
-    return replace(solution, refinement=Refinement(wish, met, rows, chosen, reason))
+    return replace(solution, refinement=Refinement(wish, met, tuple(tried), chosen, reason))

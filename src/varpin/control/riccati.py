@@ -64,13 +64,8 @@ def backward(
 ) -> Plan | None:
     """The plain recursion, or, where its rounding errors are large and the model is convex, that on square roots.
 
-    None where the model has no minimum.
-
-    Args:
-        steps: The steps of the motion.
-        regularization: Relative to the diagonal of Quu.
-        curvature: Second derivatives (N, Z, Z) of the steps in the cost to go, where they count.
-        fixed: Which controls (R, m) stay as they are.
+    ``curvature`` are second derivatives (N, Z, Z) of the steps in the cost to go, ``fixed`` which controls (R, m) stay
+    as they are. None where the model has no minimum.
     """
     expanded = steps.recursion(curvature, fixed)
     plain = _pass(steps, expanded, regularization, second=curvature is not None, roots=False)
@@ -84,8 +79,7 @@ def _pass(steps: Steps, given: Recursion, regularization: float, *, second: bool
     problem, end, motion = steps.problem, steps.terminal, steps.trajectory
     (S, X, Z), (N, x, _), k = given.J.shape, steps.J.shape, given.G.shape[2]
     m, R = Z - X, problem.decisions
-    gradient, hessian = np.zeros(X), np.zeros((X, X))
-    gradient[:x], hessian[:x, :x] = end.gradient, end.hessian
+    gradient, hessian = np.pad(end.gradient, (0, X - x)), np.pad(end.hessian, (0, X - x))
     if second and problem.integrator.variational:
         pull = end.cost.gradient[:, x // 2 :]
         hessian[:x, :x] += velocity_curvature(problem.scene, motion.q[-1:], motion.v[-1:], pull)[0]
@@ -112,11 +106,7 @@ def _pass(steps: Steps, given: Recursion, regularization: float, *, second: bool
             hessian=given.hessian,
         ),
         core.Gains(
-            feedforward=feedforward,
-            feedback=gains,
-            control_gradient=by_controls,
-            spread=spread,
-            factors=factors,
+            feedforward=feedforward, feedback=gains, control_gradient=by_controls, spread=spread, factors=factors
         ),
         *squares,
     )

@@ -18,14 +18,10 @@ from varpin.support.checks import JointValues, as_floats, control_array, finite_
 
 
 def around(problem: OptimalControlProblem, u: Floats, x: Floats, gains: Floats, previous: Floats | None) -> Commands:
-    """Controls u (R, m) with feedback around the states x before each decision.
+    """Controls u (R, m) with ``gains`` (R, m, 2n) around the states x before each decision.
 
-    Args:
-        problem: The problem.
-        u: The controls without feedback.
-        x: States (R, 2n); (R - 1, 2n) with linear controls, the first of which is given.
-        gains: Gains (R, m, 2n) on the states.
-        previous: Gains (R, m, m) on the previous control, around ``u``; None without.
+    ``previous`` are those (R, m, m) on the previous control around u. Of linear controls, whose first one is given,
+    there are states (R - 1, 2n).
     """
     if previous is not None:
         gains = np.concatenate([gains, previous], axis=2)

@@ -19,12 +19,7 @@ _SHIFT = 1e-4
 
 
 def curvature_along(steps: Steps, costate: Floats) -> Floats:
-    """Second-derivative terms of the steps in the cost to go (N, Z, Z), in their variables.
-
-    Args:
-        steps: The steps.
-        costate: Derivatives of the cost to go in the state after each step (N, 2n).
-    """
+    """Second derivatives of the steps (N, Z, Z) in the cost to go, whose slopes are ``costate`` (N, 2n) after each."""
     problem, motion = steps.problem, steps.trajectory
     scene, n, rule, N = problem.scene, problem.scene.robot.dof, problem.rule, problem.steps
     gradient = steps.running.gradient.reshape(N, len(rule), -1)

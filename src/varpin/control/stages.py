@@ -48,19 +48,10 @@ class Feedback:
 
 
 class Stake(NamedTuple):
-    """The cost at stake along a motion, without constants and noise, (O9).
+    """The cost at stake along a motion, without constants and noise, (O9)."""
 
-    For squared distances that the motion can change it is about their value.
-
-    Attributes:
-        free: Decrease of the cost's quadratic models along the motion if each state and control were free; infinite
-            where a model has no minimum, zero where the cost is least.
-        moved: The same, with each model's decrease bounded by its change over the motion's displacement, so that
-            unreachable states do not count. Tolerances are relative to it.
-    """
-
-    free: float
-    moved: float
+    free: float  # decrease of the quadratic models if all were free; infinite without a minimum, zero at the least cost
+    moved: float  # each bounded by its change over the motion's displacement: tolerances are relative to it
 
 
 def _stakes(model: Expansion, displacement: Floats) -> tuple[float, float]:
@@ -304,12 +295,7 @@ class Steps:
         return np.concatenate([np.arange(Z - m), self.states + np.arange(m)])
 
     def recursion(self, curvature: Floats | None, fixed: Mask | None) -> Recursion:
-        """The steps for the recursion.
-
-        Args:
-            curvature: Second derivatives (N, Z, Z) of the steps in the cost to go, where they count.
-            fixed: Which controls (R, m) stay as they are.
-        """
+        """The steps for the recursion, with second derivatives (N, Z, Z), and controls (R, m) that stay ``fixed``."""
         found, kept = self._wide, self._places
         if curvature is not None:
             hessian = found.hessian.copy()
@@ -350,21 +336,13 @@ class Steps:
 
 
 class Layout(NamedTuple):
-    """Where the variables of a problem are: z = (u_0, x_1, ..., x_hold, u_1, ...), and at the end a linear control.
+    """Where the variables of a problem are: z = (u_0, x_1, ..., x_hold, u_1, ...), and at the end a linear control."""
 
-    Attributes:
-        states: 2n.
-        controls: m.
-        stages: N, the number of steps.
-        hold: Steps that share a control.
-        linear: Whether there is a control at the end.
-    """
-
-    states: int
-    controls: int
-    stages: int
-    hold: int
-    linear: bool
+    states: int  # 2n
+    controls: int  # m
+    stages: int  # N, the number of steps
+    hold: int  # steps that share a control
+    linear: bool  # whether there is a control at the end
 
     @classmethod
     def of(cls, problem: OptimalControlProblem) -> Layout:
@@ -398,14 +376,10 @@ class Layout(NamedTuple):
         return np.concatenate([self.state(k), *map(self.control, ends)], axis=1)
 
     def decisions(self, feedback: Floats, previous: Floats | None) -> tuple[Integers, Floats]:
-        """The changes of controls beside feedback (R, m): u - K x - G w, with w the previous control.
+        """The changes of controls beside feedback, u - K x - G w: indices (R, Z) and derivatives (R, m, Z).
 
-        Returns the indices (R, Z) of the variables and the derivatives (R, m, Z). A control that is linear reacts to
-        the state where its line begins.
-
-        Args:
-            feedback: K (R, m, 2n).
-            previous: G (R, m, m), or None.
+        K (R, m, 2n) is on the state where a held control, or the line to a linear one, begins, G (R, m, m) on the
+        previous control w.
         """
         R, m, _ = feedback.shape
         r = np.arange(R)
@@ -416,11 +390,6 @@ class Layout(NamedTuple):
     def controls_of(self, z: Floats) -> Floats:
         """The changes of the controls (R, m) in z."""
         return z[self.control(np.arange(self.stages // self.hold + self.linear))]
-
-    def states_of(self, z: Floats) -> Floats:
-        """The changes (N + 1, 2n) of the states in z."""
-        at = self.state(np.arange(self.stages + 1))
-        return np.where(at >= 0, z[at], 0.0)
 
     def joined(self, states: Floats, controls: Floats) -> Floats:
         """The variables of changes of the states (N + 1, 2n) and of the controls (R, m)."""
@@ -449,17 +418,11 @@ class Rows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Stages(Frozen):
-    """The expansions along a motion, the matrices of (O10).
-
-    Attributes:
-        steps: The steps.
-        layout: Where the variables are.
-        costs: The costs of the steps, of control changes and of the end.
-    """
+    """The expansions along a motion, the matrices of (O10)."""
 
     steps: Steps
     layout: Layout
-    costs: tuple[Cost, ...]
+    costs: tuple[Cost, ...]  # of the steps, of the end and of control changes
 
     @property
     def J(self) -> Floats:
@@ -468,14 +431,7 @@ class Stages(Frozen):
 
     @classmethod
     def along(cls, steps: Steps, spread: Floats | None = None, curvature: Floats | None = None) -> Stages:
-        """The stages of a motion.
-
-        Args:
-            steps: The steps.
-            spread: Hessians (N, 2n, 2n) of the cost to go in the state after each step, of which noise costs the half
-                of g' S g; none without noise.
-            curvature: Second derivatives (N, Z, Z) of the steps in the cost to go, where they count.
-        """
+        """The stages of a motion, with what noise costs by Hessians S (N, 2n, 2n), and second derivatives (N, Z, Z)."""
         layout, (gradient, hessian) = Layout.of(steps.problem), steps.costs
         if spread is not None:
             gradient, hessian = (a + b for a, b in zip((gradient, hessian), steps.of_noise(spread), strict=True))

@@ -46,10 +46,6 @@ def rod_chain(
         base: Position of the first joint (3,) [m].
         armature: Armature of every joint [kg m^2 or kg].
         rail: Mass of a carriage that slides along x and carries the first joint [kg]; no carriage if left out.
-
-    Raises:
-        InputError: A value is negative or not finite, there is no link, or the numbers of masses and lengths differ.
-        SingularMassMatrix: A joint moves no inertia.
     """
     links = count("number of lengths", len(lengths), 1)
     sizes, weights = finite_array("lengths", lengths, (links,)), finite_array("masses", masses, (links,))

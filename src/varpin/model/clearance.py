@@ -195,9 +195,6 @@ class Clearance(Frozen):
 
         The N rows of q passed to :meth:`distances` are then at these times: N is a multiple of K, and row i belongs to
         the time i mod K.
-
-        Raises:
-            InputError: The function of a moving obstacle fails.
         """
         if not self.moves:
             return self
@@ -335,10 +332,6 @@ def clearance(
             links that overlap at q = 0.
         srdf: A file whose ``disable_collisions`` elements exclude pairs of links.
         capsules: (begin, end, radius) in a link's own axes [m], instead of the capsule fitted around its shapes.
-
-    Raises:
-        RobotError: A mesh is missing, or the SRDF file cannot be read.
-        InputError: A link has no shape, the SRDF file has no link of the robot, or nothing is left to keep clear of.
     """
     if capsules is not None and not isinstance(capsules, Mapping):
         raise InputError(f"capsules must be a dictionary, link: (begin, end, radius), got {type(capsules).__name__}")

@@ -3,7 +3,7 @@
 Its 6.x wheels contain data and no Python module, so files are found through the metadata of the distribution.
 """
 
-import csv
+import re
 from importlib import metadata
 from pathlib import Path
 
@@ -62,12 +62,18 @@ FLOATING_BASE = frozenset([
 ])  # fmt: skip
 
 
-def find(name: str) -> Files | None:
-    """The files of a robot; None if there is none of this name.
+def robots_dir() -> Path | None:
+    """The folder of the installed robots, as the installer recorded it; None if the package is not installed."""
+    try:
+        distribution = metadata.distribution(DISTRIBUTION)
+    except metadata.PackageNotFoundError:
+        return None
+    found = re.search(r"^.*share/example-robot-data/robots/", distribution.read_text("RECORD") or "", re.MULTILINE)
+    return Path(str(distribution.locate_file(found[0]))).resolve() if found else None
 
-    Raises:
-        RobotError: It has no fixed base, or is not installed.
-    """
+
+def find(name: str) -> Files | None:
+    """The files of a robot; None if there is none of this name."""
     if name in FLOATING_BASE:
         raise RobotError(
             f"{name!r} has a free-flyer base in example-robot-data, and varpin models fixed bases; "
@@ -75,47 +81,17 @@ def find(name: str) -> Files | None:
         )
     if name not in FIXED_BASE:
         return None
-    path = locate(FIXED_BASE[name])
-    # The folder in which package://example-robot-data/... is looked up.
-    share = next(folder.parent for folder in path.parents if folder.name == "example-robot-data")
-    return Files(name, path, (str(share),), srdf=locate(SRDF[name]) if name in SRDF else None)
-
-
-def locate(relative: str) -> Path:
-    """The installed file at ``relative`` below the robots folder.
-
-    Raises:
-        RobotError: example-robot-data is not installed, or its version does not contain the file.
-    """
-    try:
-        files = _files(relative)
-    except metadata.PackageNotFoundError:
-        raise RobotError(
-            f"{relative} is in {DISTRIBUTION}, which is not installed: pip install {DISTRIBUTION}"
-        ) from None
-    for file in files:
-        if file.endswith(f"example-robot-data/robots/{relative}"):
-            return Path(str(metadata.distribution(DISTRIBUTION).locate_file(file))).resolve()
-    raise RobotError(f"the installed {DISTRIBUTION} {metadata.version(DISTRIBUTION)} does not contain {relative}")
+    folder = robots_dir()
+    if folder is None:
+        raise RobotError(f"robot {name!r} is in {DISTRIBUTION}, which is not installed: pip install {DISTRIBUTION}")
+    path = folder / FIXED_BASE[name]
+    if not path.is_file():
+        raise RobotError(f"the installed {DISTRIBUTION} {metadata.version(DISTRIBUTION)} does not contain {path}")
+    # package://example-robot-data/... is looked up in the folder of the package.
+    return Files(name, path, (str(folder.parents[1]),), srdf=folder / SRDF[name] if name in SRDF else None)
 
 
 def installed() -> tuple[str, ...]:
     """Names of the fixed-base robots in the installed example-robot-data; empty if it is not installed."""
-    try:
-        files = _files()
-    except metadata.PackageNotFoundError:
-        return ()
-    held = {file.rpartition("example-robot-data/robots/")[2] for file in files}
-    return tuple(name for name, relative in FIXED_BASE.items() if relative in held)
-
-
-def _files(part: str = "") -> list[str]:
-    """Files of the distribution with ``part`` in their path, as the installer recorded them.
-
-    ``metadata.files`` takes longer.
-
-    Raises:
-        PackageNotFoundError: It is not installed.
-    """
-    record = metadata.distribution(DISTRIBUTION).read_text("RECORD") or ""
-    return [row[0] for row in csv.reader(line for line in record.splitlines() if part in line) if row]
+    folder = robots_dir()
+    return tuple(name for name, path in FIXED_BASE.items() if folder is not None and (folder / path).is_file())

@@ -54,11 +54,7 @@ class Hull(Frozen):
 
 
 def hull_around(name: str, points: ArrayLike) -> Hull:
-    """The convex hull of points (N, 3) [m], N >= 4.
-
-    Raises:
-        InputError: They are not such points, lie in a plane, or one vertex of the hull has too many edges for coal.
-    """
+    """The convex hull of points (N, 3) [m], N >= 4."""
     given = as_floats(name, points)
     if given.ndim != 2 or given.shape[1] != 3 or len(given) < 4:
         raise InputError(f"{name} must have shape (N, 3) with N >= 4, got {given.shape}")
@@ -84,12 +80,7 @@ def hull_around(name: str, points: ArrayLike) -> Hull:
 
 
 def mesh_points(path: str | os.PathLike[str], scale: float) -> Floats:
-    """The vertices (N, 3) [m] of a mesh file, times ``scale``.
-
-    Raises:
-        FileError: The file is missing or is no mesh that can be read.
-        InputError: ``path`` is no path or ``scale`` is not > 0.
-    """
+    """The vertices (N, 3) [m] of a mesh file, times ``scale``."""
     file = path_like("mesh path", path)
     factor = positive("mesh scale", scale, "1")
     return joined(read_mesh(str(file))).vertices * factor

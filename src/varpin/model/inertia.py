@@ -50,11 +50,7 @@ def fault(link: str, mass: float, moments: Floats) -> tuple[str, str]:
 
 
 def one_of_each(found: Iterable[tuple[str, str, str]]) -> Iterator[str]:
-    """The first sentence of each kind, and which others it is true of.
-
-    Args:
-        found: Kinds, names and sentences; those without a sentence are left out.
-    """
+    """The first sentence of each kind, and which others it is true of."""
     kinds: dict[str, list[tuple[str, str]]] = {}
     for kind, name, sentence in found:
         if sentence:
@@ -66,12 +62,7 @@ def one_of_each(found: Iterable[tuple[str, str, str]]) -> Iterator[str]:
 
 
 def faults(model: pin.Model, inertials: Iterable[Inertial]) -> Iterator[str]:
-    """Faults of the inertias of a model's moving links, one sentence a kind.
-
-    Args:
-        model: The model without mimic joints.
-        inertials: Inertias of the links of a URDF; if none of them moves, those of the model's bodies are checked.
-    """
+    """Faults of the inertias of a model's moving links, one sentence a kind."""
     links = {frame.name: frame.parentJoint for frame in model.frames if frame.type == pin.FrameType.BODY}
     found = [each for each in inertials if links.get(each.link, 0)] or inertials_of(model)
     return one_of_each(

@@ -116,22 +116,13 @@ class FrameKinematics(Frozen):
 
 
 def frame_kinematics(robot: Robot, frame: str) -> FrameKinematics:
-    """A frame by its name.
-
-    Raises:
-        UnknownFrame: The robot has no such frame.
-        InputError: No joint moves it.
-    """
+    """A frame by its name."""
     body, rotation, translation = frame_on_body(robot.free_model, frame, robot.name)
     return FrameKinematics(frame, links(robot.tree, body), rotation, translation)
 
 
 def mass_carriers(robot: Robot) -> Links:
-    """All links that joints move, for the robot's centre of mass.
-
-    Raises:
-        InputError: They have no mass.
-    """
+    """All links that joints move, for the robot's centre of mass."""
     if not robot.tree.mass.sum() > 0.0:
         raise InputError(f"the links of robot {robot.name!r} have no mass, so there is no centre of mass")
     return links(robot.tree)

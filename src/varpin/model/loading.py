@@ -27,9 +27,9 @@ from varpin.support.checks import (
     as_floats,
     broadcast_array,
     finite,
-    is_one_of,
     require_finite,
     rotation_matrix,
+    word,
 )
 
 logger = logging.getLogger(__name__)
@@ -104,8 +104,7 @@ def load_robot(
         InputError: A xacro file has no argument of that name, or a base or an armature is invalid.
         SingularMassMatrix: A joint moves no inertia, or a negative one.
     """
-    if not is_one_of(inertia, ("file", "meshes")):
-        raise InputError(f"inertia must be 'file' or 'meshes', got {inertia!r}")
+    word("inertia", inertia, ("file", "meshes"))
     whole = describe(source, package_dirs, mimic=mimic, xacro_args=xacro_args, srdf=srdf)
     if inertia == "meshes":
         whole = with_mesh_inertias(whole, density)
@@ -139,11 +138,7 @@ def assemble(
 
 
 def _on_base(robot: Robot, base: Base) -> Robot:
-    """The robot on a placed base, (4, 4) or a pin.SE3, or on a base that moves in a plane.
-
-    Raises:
-        InputError: ``base`` is none of these, or a joint of the robot has the name of a joint of the planar base.
-    """
+    """The robot on a placed base, (4, 4) or a pin.SE3, or on a base that moves in a plane."""
     if base is None:
         return robot
     if not isinstance(base, str):
@@ -157,11 +152,7 @@ def _on_base(robot: Robot, base: Base) -> Robot:
 
 
 def transform(base: ArrayLike | pin.SE3, what: str, otherwise: str = "") -> pin.SE3:
-    """A placement from a matrix (4, 4) of rounded numbers.
-
-    Raises:
-        InputError: It is none; the message calls it ``what``, and names what it may be ``otherwise``.
-    """
+    """A placement from a matrix (4, 4) of rounded numbers."""
     matrix = as_floats(what, base.homogeneous if isinstance(base, pin.SE3) else base)
     if matrix.shape != (4, 4) or (matrix[3] != [0.0, 0.0, 0.0, 1.0]).any():
         raise InputError(
@@ -237,10 +228,6 @@ def hold_joints(robot: Robot, lock: Mapping[str, ArrayLike]) -> Robot:
     Followers of locked leaders are locked as well. Continuous joints among leaders and followers become revolute joints
     without limits: a (cos, sin) pair loses whole turns, which matter to a gear, and Pinocchio cannot tie such a joint
     to one of another kind.
-
-    Raises:
-        UnknownJoint: The robot has no such joint.
-        RobotError: No joint is left.
     """
     model, index = robot.free_model, joint_index(robot.free_model)
     leaders = {tie.follower: tie for tie in robot.ties}

@@ -28,12 +28,7 @@ def _gaps(shape: pin.coal.CollisionGeometry) -> float:
 
 
 def with_mesh_inertias(robot: Robot, density: float) -> Robot:
-    """Give the links of a URDF that have no inertia that of their visual shapes, at uniform density [kg/m^3].
-
-    Raises:
-        InputError: The robot does not come from a URDF, or the density is not positive.
-        RobotError: A mesh is missing, cannot be read, or bounds no volume; the message names link and file.
-    """
+    """Give the links of a URDF that have no inertia that of their visual shapes, at uniform density [kg/m^3]."""
     density = positive("density", density, "kg/m^3")
     if robot.urdf is None:
         raise InputError(f"inertia='meshes' needs a URDF file; {robot.name!r} does not come from one")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import logging
-import re
 import textwrap
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -92,9 +91,6 @@ def read_mesh(path: str) -> tuple[MeshPart, ...]:
 
     Returns:
         Its parts, in metres: at least one for each material.
-
-    Raises:
-        FileError: The file is missing, is no mesh, or has no triangles.
     """
     file = Path(path)
     if not is_file(file):
@@ -126,39 +122,29 @@ def _read_plain(file: Path, content: bytes) -> list[MeshPart]:  # noqa: ARG001
     return [joined([MeshPart(_floats(mesh.vertices), np.asarray(mesh.faces, dtype=np.int64))])]
 
 
-class _Library:
-    """The material libraries and images of a Wavefront file, as trimesh asks for them."""
-
-    def __init__(self, file: Path, libraries: Sequence[str]) -> None:
-        self.file = file
-        self.pictures: dict[str, Path | None] = {}
-        self.text = b""
-        for name in libraries:
-            try:
-                self.text += (file.parent / name.strip().replace("\\", "/")).read_bytes() + b"\n"
-            except OSError:
-                logger.info("%s: its material library %r is missing, so its colours are unknown", file, name)
-
-    def __getitem__(self, name: str) -> bytes:
-        return self.text
-
-    def get(self, name: str) -> bytes:
-        # Options may precede the name of the file.
-        last = name.rsplit(" ", maxsplit=1)[-1]
-        found = self.pictures[name] = _texture(last if is_file(self.file.parent / last) else name, self.file)
-        return b"" if found is None else found.read_bytes()
-
-
 def _read_wavefront(file: Path, content: bytes) -> list[MeshPart]:
     from trimesh.exchange.obj import load_obj  # noqa: PLC0415 - takes a while
     from trimesh.geometry import triangulate_quads  # noqa: PLC0415 - as above
+    from trimesh.resolvers import FilePathResolver  # noqa: PLC0415 - as above
 
-    text = content.decode("utf-8", errors="replace").replace("\\\n", " ")
-    if re.search(r"^[ \t]|^f.*-|^[fv].*#", text, re.MULTILINE):
-        text = _simplified(text)
-    mention = re.compile(r"^mtllib\s+(.*)$", re.MULTILINE)
-    library = _Library(file, mention.findall(text))
-    loaded = load_obj(io.StringIO("mtllib all\n" + mention.sub("", text)), resolver=library)
+    class Beside(FilePathResolver):
+        """Material libraries and images in the folder of the file; the log tells which are missing."""
+
+        def get(self, name: str) -> Any:
+            try:
+                return super().get(named(name))
+            except OSError:
+                level = logging.INFO if name.endswith(".mtl") else logging.WARNING
+                logger.log(level, "%s: its texture or material library %r is not there", file, name)
+                raise
+
+    def named(words: str) -> str:
+        """The name of a file, which options may precede."""
+        return words if is_file(file.parent / words) else words.rsplit(" ", maxsplit=1)[-1]
+
+    loaded = load_obj(
+        io.StringIO(content.decode("utf-8", errors="replace")), resolver=Beside(str(file), allow_anywhere=True)
+    )
     parts = []
     for mesh in loaded.get("geometry", {}).values():
         visual, normals, colors = mesh.get("visual"), mesh.get("vertex_normals"), mesh.get("vertex_colors")
@@ -168,7 +154,6 @@ def _read_wavefront(file: Path, content: bytes) -> list[MeshPart]:
         if "kd" in looks:
             opacity = float(looks["d"][-1]) if "d" in looks else 1.0 - float(looks.get("tr", ["0"])[-1])
             color = np.clip([*looks["kd"], opacity], 0.0, 1.0)
-        # A material of trimesh's own has an image of its own.
         image = getattr(getattr(material, "image", None), "info", {}).get("file_path")
         parts.append(
             MeshPart(
@@ -178,7 +163,7 @@ def _read_wavefront(file: Path, content: bytes) -> list[MeshPart]:
                 None if getattr(visual, "uv", None) is None else _floats(visual.uv),
                 None if colors is None else _floats(colors)[:, :3],
                 color,
-                texture=library.pictures.get(str(image)),
+                texture=None if image is None else _texture(named(image), file),
             )
         )
     return parts[::-1]
@@ -359,11 +344,7 @@ def shape_points(shape: pin.GeometryObject) -> Floats:
 
 
 def put_mesh(shape: pin.GeometryObject, path: str, scale: ArrayLike, read: Reader) -> None:
-    """Give a shape the mesh of a file.
-
-    Raises:
-        FileError: As :func:`read_mesh`.
-    """
+    """Give a shape the mesh of a file."""
     shape.geometry = coal_shape(_scaled(read(path), scale))
     shape.meshPath, shape.meshScale = path, _floats(scale)
 

@@ -14,7 +14,8 @@ import pinocchio as pin
 from varpin.errors import RobotError
 from varpin.model.urdf import Mimic, listed
 
-_POSITIONS = ("lowerPositionLimit", "upperPositionLimit")
+# Attributes of a pin.Model with one number for each entry of a configuration.
+POSITION_LIMITS = ("lowerPositionLimit", "upperPositionLimit")
 # Attributes of a pin.Model with one number for each degree of freedom.
 JOINT_PARAMETERS = (
     "lowerVelocityLimit",
@@ -49,9 +50,6 @@ def ties_of(mimics: Mapping[str, Mimic], model: pin.Model) -> tuple[tuple[Tie, .
     """The ties of a URDF's mimic elements, and a remark on followers whose leaders are not there, which stay free.
 
     Where a leader is itself a follower, the tie is to the leader of that one.
-
-    Raises:
-        RobotError: Joints follow each other in a loop.
     """
     index = joint_index(model)
     ties: dict[int, Tie] = {}
@@ -100,9 +98,6 @@ def depth_first(model: pin.Model, ties: Sequence[Tie]) -> list[int]:
     """An order of the joints that Pinocchio's algorithms accept: subtrees contiguous, leaders before followers.
 
     The given order is kept where it qualifies.
-
-    Raises:
-        RobotError: A follower carries its own leader, or each of two branches follows the other.
     """
     parents = list(model.parents)
 
@@ -256,7 +251,7 @@ def rebuild(
             joints[joint], places[joint] = index, pin.SE3.Identity()
             copy = new.joints[index]
             for names, first, own, size in (
-                (_POSITIONS, copy.idx_q, old.idx_q, old.nq if old.nq == copy.nq else 0),
+                (POSITION_LIMITS, copy.idx_q, old.idx_q, old.nq if old.nq == copy.nq else 0),
                 (JOINT_PARAMETERS, copy.idx_v, old.idx_v, old.nv if old.nv == copy.nv else 0),
             ):
                 for name in names:

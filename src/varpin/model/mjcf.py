@@ -46,11 +46,7 @@ def is_mjcf(path: Path) -> bool:
 
 
 def root_tag(path: Path) -> str:
-    """Tag of the root element of a file; empty if the file is not well-formed XML.
-
-    Raises:
-        FileError: The file cannot be read.
-    """
+    """Tag of the root element of a file; empty if the file is not well-formed XML."""
     try:
         return read_xml(path).tag
     except RobotError:
@@ -63,10 +59,6 @@ def read_mjcf(path: Path) -> tuple[pin.Model, tuple[str, ...], tuple[Equality, .
     Returns:
         Its bodies, joints, sites, keyframes and gravity as a model; what that leaves out, in words; and the file's
         active equality constraints.
-
-    Raises:
-        MissingDependency: MuJoCo is not installed.
-        RobotError: MuJoCo cannot read it.
     """
     walk = _Walk(path)
     walk.add_parameters()
@@ -83,12 +75,7 @@ def read_mjcf(path: Path) -> tuple[pin.Model, tuple[str, ...], tuple[Equality, .
 
 
 def mjcf_shapes(path: Path) -> tuple[pin.Model, pin.GeometryModel]:
-    """The geoms of an MJCF file that MuJoCo's viewer shows, and those without contacts, on the joints of its model.
-
-    Raises:
-        MissingDependency: MuJoCo is not installed.
-        RobotError: MuJoCo cannot read the file.
-    """
+    """The geoms of an MJCF file that MuJoCo's viewer shows, and those without contacts, on the joints of its model."""
     walk = _Walk(path)
     return walk.model, walk.shapes()
 

@@ -59,12 +59,7 @@ class Payload:
 
 
 def carry(model: pin.Model, payload: Sequence[Payload], robot: str) -> None:
-    """Add payloads to the links of ``model``.
-
-    Raises:
-        UnknownFrame: The model has no such frame.
-        InputError: The frame does not move.
-    """
+    """Add payloads to the links of ``model``."""
     for part in payload:
         if not isinstance(part, Payload):
             raise InputError(f"payload must be a varpin.Payload or a sequence of them, got {type(part).__name__}")

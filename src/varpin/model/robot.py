@@ -24,7 +24,7 @@ from varpin.model.mimic import Tie, rebuild, tied_model
 from varpin.model.mjcf import mjcf_shapes
 from varpin.model.srdf import Posture
 from varpin.model.tree import flatten, mechanism, place_of_frame, to_pinocchio
-from varpin.model.units import NO_LIMIT, slides_hint
+from varpin.model.units import NO_LIMIT
 from varpin.model.urdf import Inertial, build_shapes, listed, read_urdf
 from varpin.support import markup
 from varpin.support.checks import JointValues, as_floats, joint_array
@@ -313,7 +313,6 @@ class Robot(Frozen):
         if names := self._position_limits[2]:
             joints = listed(map(repr, names), "mimic joints")
             yield f"limits that leave the joint that a mimic joint follows no room are left out: those of {joints}"
-        yield from filter(None, [slides_hint(self)])
 
     @property
     def damping(self) -> Floats:
@@ -384,11 +383,7 @@ def require_robot(robot: object, taker: str = "") -> Robot:
 
 
 def geometry(robot: Robot) -> pin.GeometryModel:
-    """Read the robot's visual geometry from its meshes; empty where the source has none.
-
-    Raises:
-        RobotError: A mesh is missing or cannot be read; the message names it.
-    """
+    """Read the robot's visual geometry from its meshes; empty where the source has none."""
     shapes, faulty = readable_geometry(robot)
     for _, what in faulty.values():
         raise RobotError(what)
@@ -400,10 +395,6 @@ def geometry(robot: Robot) -> pin.GeometryModel:
 
 def readable_geometry(robot: Robot, read: Reader = read_mesh) -> tuple[pin.GeometryModel, dict[str, tuple[int, str]]]:
     """The readable part of :func:`geometry`, link by link.
-
-    Args:
-        robot: The robot.
-        read: Reads a mesh file.
 
     Returns:
         The shapes of the links that can be read, and for each other link by name, its joint in ``free_model`` and its
@@ -437,14 +428,7 @@ def readable_geometry(robot: Robot, read: Reader = read_mesh) -> tuple[pin.Geome
 
 
 def _hang(robot: Robot, full: pin.Model, shapes: pin.GeometryModel, prefix: str = "") -> pin.GeometryModel:
-    """Hang shapes of another model, such as that of the file before joints were locked, on the frames of a robot.
-
-    Args:
-        robot: The robot.
-        full: The other model.
-        shapes: Shapes on ``full``.
-        prefix: Prefix of its frames in the robot.
-    """
+    """Hang shapes of another model, such as that of the file before joints were locked, on the frames of a robot."""
     model = robot.free_model
     for shape in shapes.geometryObjects:
         link = full.frames[shape.parentFrame]
@@ -456,12 +440,7 @@ def _hang(robot: Robot, full: pin.Model, shapes: pin.GeometryModel, prefix: str 
 
 
 def check_inertia(robot: Robot) -> None:
-    """Refuse a robot whose mass matrix is singular at q = 0 or at a few seeded random configurations.
-
-    Raises:
-        SingularMassMatrix: The mass matrix is singular; the message names the joints that move no inertia.
-        RobotError: The mass matrix is not finite.
-    """
+    """Refuse a robot whose mass matrix is singular at q = 0 or at a few seeded random configurations."""
     rng, core = np.random.default_rng(0), mechanism(robot.tree)
     for q in [np.zeros(robot.dof), *rng.uniform(-np.pi, np.pi, (3, robot.dof))]:
         with np.errstate(all="ignore"):

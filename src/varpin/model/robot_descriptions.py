@@ -25,12 +25,7 @@ def names() -> tuple[str, ...]:
 
 
 def download(name: str) -> Files:
-    """The files of one of the robots, from the package's cache or from the network.
-
-    Raises:
-        MissingDependency: The package is not installed.
-        RobotError: The download fails, the robot walks or flies, or it has no URDF, xacro or MJCF file.
-    """
+    """The files of one of the robots, from the package's cache or from the network."""
     try:
         package = importlib.import_module("robot_descriptions")
     except ImportError as error:

@@ -15,14 +15,14 @@ import pinocchio as pin
 from varpin.errors import FileError, InputError, RobotError, RobotNotFound
 from varpin.model import example_robot_data, robot_descriptions
 from varpin.model.equalities import Closure
-from varpin.model.mimic import JOINT_PARAMETERS, depth_first, joint_frames, of_mimics, ties_of
+from varpin.model.mimic import JOINT_PARAMETERS, POSITION_LIMITS, depth_first, joint_frames, of_mimics, ties_of
 from varpin.model.mjcf import is_mjcf, read_mjcf, root_tag
 from varpin.model.packages import Files, Packages
 from varpin.model.robot import Robot
 from varpin.model.srdf import beside, read_srdf, reference_postures
 from varpin.model.urdf import read_urdf
 from varpin.model.xacro import expand, is_xacro, plain_name
-from varpin.support.checks import is_one_of
+from varpin.support.checks import is_file, path_like, word
 
 logger = logging.getLogger(__name__)
 
@@ -64,16 +64,11 @@ def describe(
 
     Joints of any kind are there, and none is locked.
     """
-    if not is_one_of(mimic, ("tied", "free")):
-        raise InputError(f"mimic must be 'tied' or 'free', got {mimic!r}")
+    word("mimic", mimic, ("tied", "free"))
     if xacro_args is not None and not isinstance(xacro_args, Mapping):
         raise InputError(f"xacro_args must be a mapping of names to values, got {xacro_args!r}")
-    if not (srdf is None or isinstance(srdf, str | os.PathLike)):
-        raise InputError(f"srdf must be the path of a file, got {type(srdf).__name__}")
-    files = Files("", Path())
-    if isinstance(source, str | os.PathLike):
-        files = _find(source)
-    arguments, path = xacro_args or {}, None if srdf is None else Path(srdf).expanduser()
+    arguments, path = xacro_args or {}, None if srdf is None else path_like("srdf", srdf)
+    files = _find(source) if isinstance(source, str | os.PathLike) else Files("", Path())
     files = replace(
         files,
         folders=(*_folders(package_dirs), *files.folders),
@@ -104,13 +99,10 @@ def _find(source: str | os.PathLike[str]) -> Files:
         raise InputError(
             "source is the text of a file, not its path: write it to a file, or give pin.buildModelFromXML(text)"
         )
-    path = Path(text).expanduser()
+    path = path_like("source", source)
     is_path = isinstance(source, os.PathLike) or path.suffix or os.sep in text
-    try:
-        if is_path and path.is_file():
-            return Files(plain_name(path), path.resolve())
-    except OSError as error:
-        raise FileError(f"cannot read the URDF file: {error.strerror}: {str(path)[:80]!r}") from None
+    if is_path and is_file(path):
+        return Files(plain_name(path), path.resolve())
     bundled = bundled_robots()
     if text in bundled:
         return Files(text, bundled[text])
@@ -119,7 +111,7 @@ def _find(source: str | os.PathLike[str]) -> Files:
     downloadable = robot_descriptions.names()
     if text in downloadable or (not downloadable and not is_path and text.endswith(robot_descriptions.SUFFIX)):
         return robot_descriptions.download(text)
-    if is_path and path.is_dir():
+    if is_path and os.path.isdir(path):  # noqa: PTH112 - False for a name that is too long
         files = ", ".join(sorted(file.name for file in path.glob("*.urdf"))) or "no URDF file"
         raise RobotError(f"{path} is a folder, not a URDF file; it contains {files}")
     if is_path:
@@ -173,20 +165,11 @@ def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) ->
 
 
 def _check_model(model: pin.Model, name: str) -> None:
-    """Refuse an inconsistent model: Pinocchio's algorithms do not check it, and crash the process."""
-    n, nq, nv = model.njoints, model.nq, model.nv
-    sizes = dict.fromkeys(("joints", "names", "parents", "inertias", "jointPlacements"), n)
-    sizes |= dict.fromkeys(("lowerPositionLimit", "upperPositionLimit"), nq)
-    sizes |= dict.fromkeys(JOINT_PARAMETERS, nv)
+    """Refuse parameters of another size: Pinocchio's algorithms do not check it, and crash the process."""
+    sizes = dict.fromkeys(POSITION_LIMITS, model.nq) | dict.fromkeys(JOINT_PARAMETERS, model.nv)
     for part, size in sizes.items():
         if (found := len(getattr(model, part))) != size:
             raise RobotError(f"model {name!r} is damaged: its {part} has {found} entries instead of {size}")
-    for joint, parent in enumerate(model.parents):
-        if joint and parent >= joint:
-            raise RobotError(f"model {name!r} is damaged: joint {model.names[joint]!r} comes before its parent")
-    for frame in model.frames:
-        if frame.parentJoint >= n or frame.parentFrame >= model.nframes:
-            raise RobotError(f"model {name!r} is damaged: the parent of frame {frame.name!r} does not exist")
 
 
 def _of_files(files: Files, *, tied: bool) -> Robot:

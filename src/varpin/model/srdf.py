@@ -43,16 +43,8 @@ def beside(path: Path, robot: str) -> Path | None:
 def read_srdf(path: Path, text: str | None = None) -> tuple[tuple[Posture, ...], dict[str, float]]:
     """Read an SRDF file.
 
-    Args:
-        path: Path of the file.
-        text: The SRDF text, if not the file's content.
-
     Returns:
         Its postures, and the armature of joints by name [kg m^2 or kg]: rotor inertia times squared gear ratio.
-
-    Raises:
-        FileError: The file cannot be read.
-        RobotError: It is not an SRDF, or a number in it is none.
     """
     root = read_xml(path, text)
     if root.tag != "robot":

@@ -16,13 +16,7 @@ from varpin.model.mimic import Tie
 
 
 def joint_axis(model: pin.Model, joint: int) -> tuple[bool, Floats]:
-    """Whether a one-axis joint is prismatic, and its unit axis (3,) in the joint's frame.
-
-    Raises:
-        UnsupportedJoint: The joint has another number of degrees of freedom, is a screw, or is a composite with a
-            placement of its own.
-        RobotError: Its axis is zero or not a unit vector.
-    """
+    """Whether a one-axis joint is prismatic, and its unit axis (3,) in the joint's frame."""
     kind = model.joints[joint]
     name = model.names[joint]
     if kind.nv != 1 or kind.nq > 2:
@@ -66,18 +60,7 @@ def _is_rigid(placement: pin.SE3) -> bool:
 
 
 def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...]) -> Tree:
-    """The tree of a model whose joints all have one axis.
-
-    Args:
-        model: The model without mimic joints.
-        ties: Mimic joints.
-        coordinates: Indices of the joints that are generalized coordinates, in their order.
-
-    Raises:
-        UnsupportedJoint: A joint has no single axis.
-        RobotError: A link's mass, centre or inertia is NaN or infinite, or a joint's placement is not a rotation and a
-            translation.
-    """
+    """The tree of a model whose joints all have one axis."""
     tied = {tie.follower: tie for tie in ties}
     index = {joint: c for c, joint in enumerate(coordinates)}
     turn, rows = [np.eye(3)], []
@@ -124,11 +107,7 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
 
 
 def frame_index(model: pin.Model, frame: str, robot: str) -> int:
-    """Index of a frame by its name: the link's where a joint that may be elsewhere has the same.
-
-    Raises:
-        UnknownFrame: There is no such frame.
-    """
+    """Index of a frame by its name: the link's where a joint that may be elsewhere has the same."""
     names = [item.name for item in model.frames]
     if not isinstance(frame, str) or frame not in names:
         raise UnknownFrame(str(frame), names, robot)
@@ -137,12 +116,7 @@ def frame_index(model: pin.Model, frame: str, robot: str) -> int:
 
 
 def frame_on_body(model: pin.Model, frame: str, robot: str) -> tuple[int, Floats, Floats]:
-    """The body of the flat tree that carries a frame, and the frame's rotation (3, 3) and position (3,) in it.
-
-    Raises:
-        UnknownFrame: There is no such frame.
-        InputError: The frame is fixed to the base.
-    """
+    """The body of the flat tree that carries a frame, and the frame's rotation (3, 3) and position (3,) in it."""
     found = model.frames[frame_index(model, frame, robot)]
     joint = found.parentJoint
     if joint == 0:
@@ -152,11 +126,7 @@ def frame_on_body(model: pin.Model, frame: str, robot: str) -> tuple[int, Floats
 
 
 def place_of_frame(model: pin.Model, frame: str, robot: str) -> tuple[int, Floats, Floats]:
-    """As :func:`frame_on_body`; for a frame that is fixed to the base, -1 and its placement in the world.
-
-    Raises:
-        UnknownFrame: There is no such frame.
-    """
+    """As :func:`frame_on_body`; for a frame that is fixed to the base, -1 and its placement in the world."""
     found = model.frames[frame_index(model, frame, robot)]
     if found.parentJoint == 0:
         return -1, found.placement.rotation.copy(), found.placement.translation.copy()
@@ -274,13 +244,7 @@ def mechanism(tree: Tree, **values: Any) -> Mechanism:
 
 
 def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Integers:
-    """Groups of coordinates coupled by inertia or mimic joints: a label (n,) from 0 on for each coordinate.
-
-    Args:
-        parent: Parent of each body (b,), -1 at a root.
-        coordinate: Coordinate that moves each body (b,).
-        dof: n.
-    """
+    """Groups of coordinates coupled by inertia or mimic joints: a label (n,) from 0 on for each coordinate."""
     label = np.arange(dof)
     for body in np.flatnonzero(parent >= 0):
         one, other = sorted(label[coordinate[[body, parent[body]]]])
@@ -301,9 +265,6 @@ def block_ends(group: Integers) -> Integers:
     """Ends (c,) of the shortest runs of coordinates that consist of whole groups.
 
     Usually each group is one run; groups whose coordinates alternate share one.
-
-    Args:
-        group: Group of each coordinate (n,), from :func:`independent_groups`.
     """
     n = group.size
     last = np.zeros(n, dtype=np.int64)

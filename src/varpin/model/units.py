@@ -27,9 +27,6 @@ NO_LIMIT = 1e6
 AFAR = 50.0
 # Largest plausible clearance, in the same units.
 ASIDE = 2.0
-# Longest plausible travel of a slider, in the same units (an arm on a rail), and least reach that counts for it [m]:
-# sliders alone reach nowhere.
-_TRAVEL, _GANTRY = 20.0, 1.0
 # Least reach that counts [m]: a wheel has none.
 _LEAST = 0.1
 IN_MILLIMETRES = "it may be in millimetres, and lengths are in metres"
@@ -55,27 +52,20 @@ def looks_like_degrees(angle: float) -> bool:
     return abs(angle) > _TURNS
 
 
-def limits_in_degrees(lower: float, upper: float) -> bool:
-    """Whether the limits of a joint [rad] look like degrees: larger than two turns, with at most one decimal."""
-    limits = 10.0 * np.array([lower, upper])
-    typed = bool((limits == np.round(limits)).all())
-    return typed and _TURNS < max(abs(lower), abs(upper)) < _DEGREES
+def typed_in_degrees(angles: Floats) -> NDArray[np.bool_]:
+    """Whether angles [rad] are larger than two turns and have at most one decimal, as someone types degrees."""
+    tenths = 10.0 * np.clip(angles, -_DEGREES, _DEGREES)
+    return (np.abs(angles) > _TURNS) & (np.abs(angles) < _DEGREES) & (tenths == np.round(tenths))
 
 
 def degrees_hint(robot: Robot, name: str, q: Floats) -> str:
-    """A sentence about the joint of a configuration that looks most like degrees; empty if none does.
+    """A sentence about the joint of a configuration (n,) [rad or m] that looks most like degrees; empty if none does.
 
-    Joints without limits may have turned many times in an earlier motion. Of these joints only values with at most two
-    decimals count, as someone types them.
-
-    Args:
-        robot: The robot.
-        name: Name of the configuration, for the sentence.
-        q: Configuration (n,) [rad or m].
+    Joints without limits may have turned many times in an earlier motion. Of these only typed values count.
     """
     lower, upper = robot.position_limits
     bounded = np.isfinite(lower) | np.isfinite(upper)
-    wrong: NDArray[np.bool_] = ~robot.slides & np.where(bounded, (q < lower) | (q > upper), _typed(q))
+    wrong: NDArray[np.bool_] = ~robot.slides & np.where(bounded, (q < lower) | (q > upper), typed_in_degrees(q))
     angles = np.where(wrong, np.abs(q), 0.0)
     joint = int(np.argmax(angles))
     if not looks_like_degrees(float(angles[joint])):
@@ -84,21 +74,8 @@ def degrees_hint(robot: Robot, name: str, q: Floats) -> str:
     return f"{name} of {robot.joint_names[joint]!r} is {q[joint]:.4g} rad, {turns}, and looks like degrees: {ADVICE}"
 
 
-def _typed(values: Floats) -> NDArray[np.bool_]:
-    """Whether numbers have at most two decimals, as someone types them."""
-    hundredths = 100.0 * np.clip(values, -_DEGREES, _DEGREES)
-    whole: NDArray[np.bool_] = np.abs(hundredths - np.round(hundredths)) <= 1e-9 * np.abs(hundredths)
-    return (np.abs(values) < _DEGREES) & whole
-
-
 def longest_reach(robot: Robot, *, slides: bool = True, centers: bool = True) -> float:
-    """Upper bound on the distance of a centre of mass from the root of its tree [m]; infinite on free rails.
-
-    Args:
-        robot: The robot.
-        slides: Whether sliders extend it.
-        centers: Whether it is that of a centre of mass, not of a joint.
-    """
+    """Upper bound on the distance of a centre of mass from the root of its tree [m]; infinite on free rails."""
     tree = robot.tree
     lower, upper = robot.position_limits
     path = np.zeros(len(tree.parent))
@@ -111,20 +88,6 @@ def longest_reach(robot: Robot, *, slides: bool = True, centers: bool = True) ->
     return float((path + (np.linalg.norm(tree.center, axis=1) if centers else 0.0)).max())
 
 
-def slides_hint(robot: Robot) -> str:
-    """A sentence about the slider with the largest limit that looks like millimetres; empty if none does."""
-    ends = np.abs(np.where(np.isfinite(limits := np.array(robot.position_limits)), limits, 0.0)).max(axis=0)
-    most = int(np.argmax(np.where(robot.slides, ends, 0.0)))
-    reach = longest_reach(robot, slides=False)
-    if not (robot.slides[most] and ends[most] > _TRAVEL * max(reach, _GANTRY)):
-        return ""
-    return f"the limit of slider {robot.joint_names[most]!r} is {ends[most]:g} m, {_beside(robot, reach)}"
-
-
-def _beside(robot: Robot, reach: float) -> str:
-    return f"and the reach of {robot.name} at most {reach:.3g} m: {IN_MILLIMETRES}"
-
-
 def millimetres_hint(robot: Robot, lengths: dict[str, float], plausible: float = AFAR) -> str:
     """A sentence about the largest of some named lengths [m] that look like millimetres; empty if none does.
 
@@ -134,4 +97,4 @@ def millimetres_hint(robot: Robot, lengths: dict[str, float], plausible: float =
     reach = longest_reach(robot)
     if not length > plausible * max(reach, _LEAST):
         return ""
-    return f"{name} is {length:.4g} m, {_beside(robot, reach)}"
+    return f"{name} is {length:.4g} m, and the reach of {robot.name} at most {reach:.3g} m: {IN_MILLIMETRES}"

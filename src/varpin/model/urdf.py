@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from varpin.errors import FileError, RobotError
 from varpin.model.meshes import Reader, put_mesh, read_mesh
 from varpin.model.packages import LFS_POINTER, Packages
-from varpin.model.units import NO_LIMIT, limits_in_degrees
+from varpin.model.units import NO_LIMIT, typed_in_degrees
 from varpin.support.frozen import Frozen
 
 logger = logging.getLogger(__name__)
@@ -116,11 +116,6 @@ def read_urdf(path: Path, text: str | None = None) -> Urdf:
     Args:
         path: Path of the file.
         text: The URDF text, if not the file's content.
-
-    Raises:
-        FileError: The file cannot be read.
-        RobotError: Pinocchio cannot read it, a link is the child of two joints or on a loop, or a number in a mimic
-            element is invalid.
     """
     root = read_xml(path, text)
     parent: dict[str, str] = {}
@@ -198,16 +193,8 @@ def build_shapes(
 ) -> tuple[pin.GeometryModel, dict[str, str]]:
     """The visual geometry in a file, as Pinocchio reads it, except for meshes.
 
-    Args:
-        urdf: The file.
-        package_dirs: Folders in which ``package://`` paths are looked up.
-        read: Reads a mesh file.
-
     Returns:
         The shapes of the links whose meshes can all be read, and the fault of each other link in words.
-
-    Raises:
-        RobotError: A shape is no shape; the message names the file.
     """
     root, looks = _looks(urdf.root)
     text = ET.tostring(root, encoding="unicode")
@@ -262,51 +249,23 @@ def _missing_meshes(urdf: Urdf, packages: Packages) -> dict[str, str]:
 
 
 def read_xml(path: Path, text: str | None = None) -> ET.Element:
-    """The root element of an XML file, with prefixes as written.
-
-    Args:
-        path: Path of the file.
-        text: The XML text, if not the file's content.
-
-    Raises:
-        FileError: The file cannot be read.
-        RobotError: It is not well-formed XML.
-    """
+    """The root element of an XML file, with prefixes as written."""
     try:
         content = path.read_bytes() if text is None else text.encode()
     except OSError as error:
         raise FileError(f"cannot read {path}: {error.strerror}") from None
-    if not content.strip(b"\0 \t\r\n"):
-        raise RobotError(f"{path} is empty")
     if content.startswith(LFS_POINTER):
         raise RobotError(f"{path} is a Git LFS pointer, not the file itself: git lfs pull downloads it")
     # Comments often contain "--", which XML forbids. Their line breaks stay, for line numbers.
     content = _COMMENT.sub(lambda found: found[1] or b"\n" * found[0].count(b"\n"), content.lstrip(b" \t\r\n"))
-    try:
-        return _tree(content)
-    except (expat.ExpatError, LookupError) as error:
-        fault = error
-    try:
-        return _tree(_mended(content))
-    except expat.ExpatError:
-        page = content[:200].lower().startswith((b"<!doctype html", b"<html"))
-        what = "a web page, not a robot's file" if page else f"not well-formed XML: {fault}"
-        raise RobotError(f"{path} is {what}") from None
-
-
-def _mended(content: bytes) -> str:
-    """A text that expat refuses, for what Pinocchio does not mind: encodings, ``&``, what follows the robot."""
-    text = re.sub(r"^\W*<\?xml.*?\?>", "", content.decode("utf-8", errors="replace"), flags=re.DOTALL)
-    body, end, _ = re.sub(r"&(?!#?\w+;)", "&amp;", text).rpartition("</robot>")
-    return body + end
-
-
-def _tree(content: bytes | str) -> ET.Element:
     builder, parser = ET.TreeBuilder(), expat.ParserCreate()
     parser.buffer_text = True
     parser.StartElementHandler = lambda tag, has: builder.start(tag, {key: text.strip() for key, text in has.items()})
     parser.EndElementHandler, parser.CharacterDataHandler = builder.end, builder.data
-    parser.Parse(content, True)
+    try:
+        parser.Parse(content, True)
+    except (expat.ExpatError, LookupError) as error:
+        raise RobotError(f"{path} is not well-formed XML: {error}") from None
     return builder.close()
 
 
@@ -362,7 +321,7 @@ def _remarks(root: ET.Element) -> Iterator[str]:
         low, high = (_number(limit.get(key)) for key in ("lower", "upper"))
         if kind == "continuous" and low < high and high - low < NO_LIMIT:
             ignored.append(name)
-        if kind == "revolute" and limits_in_degrees(low, high):
+        if kind == "revolute" and typed_in_degrees(np.array([low, high])).any():
             degrees.append(f"{low:g} to {high:g} of {name}")
     if degrees:
         yield f"limits look like degrees, and URDF has radians: {listed(degrees, 'joints')}"
@@ -396,11 +355,7 @@ def _number(word: str | None) -> float:
 
 
 def finite_number(word: str, what: str) -> float:
-    """A word as a finite number.
-
-    Raises:
-        RobotError: It is not one; the message calls it ``what``.
-    """
+    """A word as a finite number."""
     if not math.isfinite(value := _number(word)):
         raise RobotError(f"{what} is {reprlib.repr(word)}, where a finite number belongs")
     return value

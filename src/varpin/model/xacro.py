@@ -67,11 +67,6 @@ def expand(
         package_dirs: Folders in which ``$(find package)`` is looked up, after those that contain the file.
         packages: Known folders of packages by name.
         strict: Whether an argument that the file does not use is an error.
-
-    Raises:
-        MissingDependency: The package xacro is not installed.
-        InputError: The file has no such argument.
-        RobotError: The file cannot be expanded.
     """
     xacro, substitution = _package(path)
     if path.read_bytes().startswith(LFS_POINTER):

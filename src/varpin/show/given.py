@@ -30,16 +30,10 @@ def problem_of(given: object) -> OptimalControlProblem | None:
 
 
 def frame_names(option: str, robots: Sequence[Robot], names: bool | str | Sequence[str]) -> list[tuple[str, ...]]:
-    """The requested frames of each robot.
-
-    Args:
-        option: Name of the option, for messages.
-        robots: The robots.
-        names: One or several names, of which each robot takes those it has; True for its end effector.
+    """The frames of each robot: of the given names those it has; for True its end effector.
 
     Raises:
-        InputError: They are no names.
-        UnknownFrame: No robot has a frame of that name.
+        InputError: They are no names, or, as UnknownFrame, no robot has a frame of that name; ``option`` is named.
     """
     if isinstance(names, bool | np.bool_):
         return [(robot.end_effector,) if names else () for robot in robots]

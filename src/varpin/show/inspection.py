@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import os
+import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
@@ -19,19 +20,24 @@ from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot, check_inertia, longest_reach, readable_geometry
 from varpin.model.inertia import fault, inertials_of, one_of_each, principal_moments
-from varpin.model.loading import Base, assemble
+from varpin.model.loading import assemble
 from varpin.model.meshes import shape_points
 from varpin.model.mimic import joint_index
 from varpin.model.robot import limits_of
 from varpin.model.sources import describe
 from varpin.model.tree import is_unbounded, joint_axis
 from varpin.model.urdf import listed
-from varpin.show.inspection_report import FrameKind, FrameReport, JointReport, Kind, LinkReport, RobotReport
+from varpin.support import markup
 from varpin.support.checks import JointValues, joint_array
+from varpin.support.frozen import Frozen
+from varpin.support.tables import Table
 
-# Thresholds of warnings: the ratio of masses of neighbouring links, and the condition number of M with a unit diagonal.
-# The largest values among the arms of example-robot-data are 320 and 830.
-MASS_RATIO = 1e3
+Kind = Literal["revolute", "prismatic", "continuous", "mimic"]
+FrameKind = Literal["link", "joint", "fixed joint", "frame"]
+
+# A largest step beyond this counts as no limit [s].
+_ANY_STEP = 100.0
+# Largest plausible condition number of M with a unit diagonal; 830 among the arms of example-robot-data.
 CONDITION = 1e6
 # Largest plausible radius of gyration and centre of mass distance of a link, as a multiple of the arm's reach, and [m]
 # for an arm with all joints in one place.
@@ -45,51 +51,223 @@ SIZE_RATIO = 1.5
 MESH_RATIOS = (0.01, 10.0)
 # Density of osmium, the densest element [kg/m^3].
 DENSITY = 22_600.0
+# Options of :func:`varpin.load_robot` that say how a file is read; the others change the robot.
+_READING = frozenset({"package_dirs", "mimic", "xacro_args", "srdf"})
+
+
+@dataclass(frozen=True, eq=False)
+class JointReport(Frozen):
+    """A joint that moves.
+
+    Attributes:
+        name: Name of the joint.
+        kind: Revolute, prismatic, continuous (revolute without limits) or mimic.
+        axis: Unit axis (3,) in the joint's own frame.
+        unit: Unit of its position, rad or m.
+        lower: Lower position limit [rad or m], -inf if none.
+        upper: Upper position limit [rad or m], inf if none.
+        velocity: Velocity limit [rad/s or m/s], inf if none.
+        effort: Effort limit [N m or N], inf if none.
+        follows: Leader, ratio and offset of a mimic joint, in words; empty for others.
+    """
+
+    name: str
+    kind: Kind
+    axis: Floats
+    unit: Literal["rad", "m"]
+    lower: float
+    upper: float
+    velocity: float
+    effort: float
+    follows: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class LinkReport(Frozen):
+    """A link with mass or inertia; for a model in memory, all links on a joint together.
+
+    Attributes:
+        name: Name of the link.
+        joint: The joint that moves it, or empty for a link of the base.
+        mass: Mass [kg].
+        center: Centre of mass (3,) in the link's frame [m].
+        inertia: Inertia (3, 3) about the centre of mass [kg m^2].
+    """
+
+    name: str
+    joint: str
+    mass: float
+    center: Floats
+    inertia: Floats
+
+    @property
+    def moments(self) -> Floats:
+        """Principal moments of inertia (3,), ascending [kg m^2]."""
+        return principal_moments(self.inertia)
+
+
+@dataclass(frozen=True)
+class FrameReport:
+    """A frame, for the names that costs, traces and payloads take.
+
+    Attributes:
+        name: Name of the frame.
+        kind: Whether it belongs to a link, a joint, a fixed joint, or none of them.
+        parent: The link or frame that it is attached to, or empty for the world.
+        joint: The joint that moves it, or empty if it is fixed to the base.
+    """
+
+    name: str
+    kind: FrameKind
+    parent: str
+    joint: str
+
+
+@dataclass(frozen=True, eq=False)
+class RobotReport(Frozen):
+    """The content of a robot description, and warnings; ``print`` shows it in tables.
+
+    Attributes:
+        robot: The robot, possibly one that :func:`varpin.load_robot` refuses.
+        joints: Moving joints, mimic joints included, in Pinocchio's order.
+        links: Links with mass or inertia.
+        frames: Frames that varpin finds by name, in Pinocchio's order.
+        locked: Locked joints and their positions [rad or m].
+        total_mass: Mass of all moving links [kg].
+        q: Configuration of the report (n,) [rad or m].
+        v: Velocity of the report (n,) [rad/s or m/s].
+        condition: Condition number of M(q); it mixes units if there are prismatic joints. Infinite if singular.
+        scaled_condition: Condition number of M(q) with rows and columns scaled to a unit diagonal, which does not
+            depend on units. Infinite if singular.
+        largest_step: Largest dt [s] whose step the midpoint integrator's branch guard accepts around (q, v); infinite
+            where no direction is unstable, None where M is singular. It is not a measure of accuracy.
+        branch_margin: The guard's margin, for which ``largest_step`` holds.
+        warnings: What looks wrong, in words that name the joint or link.
+    """
+
+    robot: Robot = field(repr=False)
+    joints: tuple[JointReport, ...]
+    links: tuple[LinkReport, ...]
+    frames: tuple[FrameReport, ...]
+    locked: Mapping[str, float | tuple[float, ...]]
+    total_mass: float
+    q: Floats
+    v: Floats
+    condition: float
+    scaled_condition: float
+    largest_step: float | None
+    branch_margin: float
+    warnings: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        warned = markup.warning_count(self.warnings)
+        return f"RobotReport({self.robot.name}: {len(self.joints)} joints, {len(self.links)} links{warned})"
+
+    def __str__(self) -> str:
+        told = [f"warning: {warning}" for warning in self.warnings] or ["nothing looks wrong"]
+        return "\n".join([*(f"{table}\n" for table in self.tables), *told])
+
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """Tables of joints, links, frames and the whole robot."""
+        moving = iter(range(len(self.joints)))
+        joints: list[tuple[object, ...]] = [
+            (
+                j.name,
+                "-" if j.kind == "mimic" else next(moving),
+                j.kind,
+                _axis(j),
+                j.follows or _range(j),
+                "none" if math.isinf(j.velocity) else f"{j.velocity:g}",
+                "none" if math.isinf(j.effort) else f"{j.effort:g}",
+            )
+            for j in self.joints
+        ]
+        joints += [(name, "-", f"locked at {at}", "", "", "", "") for name, at in self.locked.items()]
+        links = [
+            (x.name, f"{x.mass:.4g}", *("  ".join(f"{y:.3g}" for y in part) for part in (x.center, x.moments)))
+            for x in self.links
+        ]
+        frames = [(x.name, x.kind, x.parent or "the world", x.joint or "the base") for x in self.frames]
+        whole = [
+            ("degrees of freedom", self.robot.dof),
+            ("mass that moves [kg]", f"{self.total_mass:.5g}"),
+            ("at q [rad or m]", "  ".join(f"{x:g}" for x in self.q)),
+            ("largest step of Midpoint", self.step_in_words),
+        ]
+        units = {"rad": "[rad]", "m": "[m]"}
+        unit = units.get("".join({j.unit for j in self.joints}), "[rad or m]")
+        per = unit.replace("]", "/s]").replace(" or", "/s or")
+        effort = {"[rad]": "[N m]", "[m]": "[N]"}.get(unit, "[N m or N]")
+        heads = "joint", "q", "kind", "axis", f"limits {unit}", f"speed {per}", f"effort {effort}"
+        name = self.robot.name
+        return (
+            Table(f"{name}: joints", heads, joints),
+            Table(f"{name}: links", ("link", "mass [kg]", "centre of mass [m]", "principal moments [kg m^2]"), links),
+            Table(f"{name}: frames", ("frame", "what it is", "on", "moved by"), frames),
+            Table(f"{name}: as a whole", (), whole),
+        )
+
+    @property
+    def step_in_words(self) -> str:
+        """The largest step that the midpoint integrator accepts around (q, v), in words."""
+        if self.largest_step is None:
+            return "undefined: the mass matrix is singular"
+        # Rounded numbers in a description, such as a turn by 1.5708, make neutral directions slightly unstable.
+        step = "any: nothing is unstable" if self.largest_step > _ANY_STEP else f"{self.largest_step:.3g} s"
+        return f"{step} at this q, {'at rest' if not self.v.any() else 'and this v'}"
+
+    def _repr_html_(self) -> str:
+        joints, links, frames, whole = self.tables
+        rows = [(str(name), value) for name, value in whole.rows]
+        rows += [("warning", warning) for warning in self.warnings]
+        folded = (markup.folded(part.title, markup.table(part.columns, part.rows)) for part in (links, frames))
+        return markup.facts(f"Robot {self.robot.name}", rows, markup.table(joints.columns, joints.rows), *folded)
+
+
+def _range(joint: JointReport) -> str:
+    free = math.isinf(joint.lower) and math.isinf(joint.upper)
+    return "free" if free else f"{joint.lower:g} .. {joint.upper:g}"
+
+
+def _axis(joint: JointReport) -> str:
+    for letter, component in zip("xyz", joint.axis, strict=True):
+        if abs(abs(component) - 1.0) < 1e-9:
+            return f"{'+' if component > 0.0 else '-'}{letter}"
+    return "(" + ", ".join(f"{component:.3g}" for component in joint.axis) + ")"
 
 
 def inspect_robot(
     source: object,
     *,
-    package_dirs: Sequence[str | os.PathLike[str]] | None = None,
-    lock: Mapping[str, ArrayLike] | None = None,
-    keep: Sequence[str] | None = None,
-    mimic: Literal["tied", "free"] = "tied",
     q: JointValues | None = None,
     v: JointValues | None = None,
     gravity: ArrayLike | bool = True,
-    base: Base = None,
-    armature: JointValues | None = None,
+    meshes: bool = True,
+    **loading: Any,
 ) -> RobotReport:
     """Report on a robot description, valid or faulty.
 
-    Main args:
+    Args:
         source: A source as for :func:`varpin.load_robot`, or a loaded robot.
-        lock: Joints to lock, as for :func:`varpin.load_robot`.
-        keep: Joints that stay, as for :func:`varpin.load_robot`.
         q: Configuration of the report: one number, (n,) or by joint name [rad or m]; 0 if left out.
         v: Velocity of the report, likewise [rad/s or m/s]; 0 if left out.
-
-    Other Args:
-        package_dirs: As for :func:`varpin.load_robot`.
-        mimic: As for :func:`varpin.load_robot`.
         gravity: As for :class:`varpin.Scene`; the largest step depends on it.
-        base: As for :func:`varpin.load_robot`.
-        armature: As for :func:`varpin.load_robot`.
+        meshes: Whether to compare inertias with the sizes of meshes, which takes seconds if their files are large.
+        loading: Options of :func:`varpin.load_robot`, such as ``lock``.
 
     Raises:
         RobotError: As for :func:`varpin.load_robot`, except for singular mass matrices.
-        InputError: ``q`` or ``v`` has a wrong shape or is not finite, or an option of loading, such as ``lock``, is
-            given with a loaded robot.
+        InputError: ``q`` or ``v`` has a wrong shape or is not finite, or options of loading are given with a loaded
+            robot.
     """
     if isinstance(source, Robot):
-        if lock or keep or package_dirs or mimic != "tied" or base is not None or armature is not None:
-            raise InputError(
-                "lock, keep, package_dirs, mimic, base and armature are options of loading; the robot is already loaded"
-            )
+        if loading:
+            raise InputError(f"{', '.join(loading)}: options of loading, and the robot is already loaded")
         robot = source
     else:
-        whole = describe(source, package_dirs, mimic=mimic)
-        robot = assemble(whole, lock=lock, keep=keep, base=base, armature=armature)
+        whole = describe(source, **{name: loading.pop(name) for name in _READING & loading.keys()})
+        robot = assemble(whole, **loading)
     scene = Scene(robot, gravity=gravity, damping=0.0, constraints=())
     configuration = joint_array("q", 0.0 if q is None else q, robot.joint_names, uniform=True)
     velocity = joint_array("v", 0.0 if v is None else v, robot.joint_names, uniform=True)
@@ -99,7 +277,7 @@ def inspect_robot(
         raise RobotError(f"robot {robot.name!r} cannot be inspected: its mass matrix or its derivatives are not finite")
     margin = Guard().branch_margin
     condition, scaled = _condition_numbers(jet.Lvv)
-    links, (shapes, unread) = _links(robot), readable_geometry(robot)
+    links, (shapes, unread) = _links(robot), readable_geometry(robot) if meshes else (pin.GeometryModel(), {})
     warnings = [
         *(*robot.faults, *robot.remarks, *robot.notes, *robot.limit_remarks()),
         *one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links, shapes))),
@@ -165,7 +343,6 @@ def _links(robot: Robot) -> tuple[LinkReport, ...]:
             mass=link.mass,
             center=link.center.copy(),
             inertia=link.inertia.copy(),
-            moments=principal_moments(link.inertia),
         )
         for link in robot.inertials or inertials_of(model)
         if link.link in joints
@@ -204,62 +381,45 @@ def _mass_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
             yield "massless", name, f"link {name!r} is massless, yet joint {joint!r} moves it; {carries}"
         elif not tree.inertia[body].any():
             yield "point mass", name, f"link {name!r} has a mass of {mass:g} kg and no rotational inertia: a point mass"
-        parent = int(tree.parent[body])
-        light, heavy = sorted((tree.mass[parent], mass)) if parent >= 0 else (mass, mass)
-        if light > 0.0 and heavy > MASS_RATIO * light:
-            sentence = (
-                f"the masses of neighbouring links {names[parent]!r} and {name!r} differ by a factor "
-                f"of {heavy / light:.1g}: {tree.mass[parent]:.3g} and {mass:.3g} kg"
-            )
-            yield "masses", name, sentence
 
 
 def _inertia_warnings(
     robot: Robot, links: Sequence[LinkReport], shapes: pin.GeometryModel
 ) -> Iterator[tuple[str, str, str]]:
-    length = LENGTH_RATIO * longest_reach(robot, slides=False, centers=False) or LENGTH
+    reach = longest_reach(robot, slides=False, centers=False)
+    length = LENGTH_RATIO * reach or LENGTH
+    span = f"where the arm's joints span {reach:.3g} m" if reach > 0.0 else "longer than any arm"
     around: dict[int, list[Floats]] = {}
     for shape in shapes.geometryObjects:
         around.setdefault(shape.parentJoint, []).append(shape_points(shape))
     frames = {frame.name: frame for frame in robot.free_model.frames if frame.type == pin.FrameType.BODY}
     for link in links:
-        if not link.joint or not link.inertia.any():
+        if not link.joint:
             continue
-        name, frame = link.name, frames.get(link.name)
+        name, away = link.name, float(np.linalg.norm(link.center))
+        if away > length:
+            far = f"link {name!r} has its centre of mass {away:.3g} m away from its frame, {span}"
+            yield "away", name, f"{far}; are these millimetres?"
         kind, sentence = fault(name, link.mass, link.moments)
-        if kind or link.mass <= 0.0:
+        if kind or link.mass <= 0.0 or not link.inertia.any():
             yield kind, name, sentence
             continue
-        # A ball has the least inertia of all bodies of a given mass and density.
-        radius = (3.0 * link.mass / (4.0 * np.pi * DENSITY)) ** (1.0 / 3.0)
-        gyration, against, size = float(np.sqrt(link.moments[-1] / link.mass)), _against_reach(robot), np.inf
+        frame, against, size = frames.get(name), span, np.inf
         if frame is not None and frame.parentJoint in around:
             points = np.vstack(around[frame.parentJoint])
             size = float(np.linalg.norm(points - frame.placement.act(link.center), axis=1).max())
         if SIZE_RATIO * size < length:
             against = f"and its body reaches {size:.2g} m from its centre of mass"
+        # A ball has the least inertia of all bodies of a given mass and density.
+        radius = (3.0 * link.mass / (4.0 * np.pi * DENSITY)) ** (1.0 / 3.0)
+        gyration = float(np.sqrt(link.moments[-1] / link.mass))
         if link.moments.sum() < 1.2 * link.mass * radius**2:
             moments = ", ".join(f"{moment:.3g}" for moment in link.moments)
-            sentence = (
-                f"link {name!r} has an implausibly small inertia: {link.mass:g} kg with principal moments "
-                f"{moments} kg m^2 would be denser than osmium"
-            )
-            yield "small", name, sentence
+            sentence = f"link {name!r} has an implausibly small inertia: {link.mass:g} kg with principal moments "
+            yield "small", name, f"{sentence}{moments} kg m^2 would be denser than osmium"
         elif gyration > min(length, SIZE_RATIO * size):
-            large = (
-                f"link {name!r} has an implausibly large inertia: its radius of gyration is {gyration:.3g} m, {against}"
-            )
-            yield "large", name, large
-    for link in links:
-        away = float(np.linalg.norm(link.center))
-        if link.joint and away > length:
-            far = f"link {link.name!r} has its centre of mass {away:.3g} m away from its frame, {_against_reach(robot)}"
-            yield "away", link.name, f"{far}; are these millimetres?"
-
-
-def _against_reach(robot: Robot) -> str:
-    reach = longest_reach(robot, slides=False, centers=False)
-    return f"where the arm's joints span {reach:.3g} m" if reach > 0.0 else "longer than any arm"
+            sentence = f"link {name!r} has an implausibly large inertia: its radius of gyration is {gyration:.3g} m, "
+            yield "large", name, sentence + against
 
 
 def _mesh_warnings(robot: Robot, shapes: pin.GeometryModel) -> Iterator[str]:

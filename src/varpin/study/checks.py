@@ -6,6 +6,7 @@ if the check does not apply. An error of at least the value in :data:`LEVELS` is
 
 from __future__ import annotations
 
+import contextlib
 import math
 from typing import Any
 
@@ -19,7 +20,7 @@ from varpin.linearization import linearize
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.simulation.simulate import simulate
-from varpin.study.exact import SHORTEST, Exact, velocity_change
+from varpin.study.exact import SHORTEST, START, Exact, velocity_change
 from varpin.trajectory import Trajectory
 
 # The measures of a motion, and the value from which on each of them is wrong. Accuracy in units of the motion itself:
@@ -30,7 +31,6 @@ LEVELS = {
     "error": 0.05,
     "joint": 0.1,
     "velocity": 0.25,
-    "period": 1.0,
     "energy": 0.1,
     "momentum": 0.1,
     "reversal": 1e-4,
@@ -39,8 +39,6 @@ LEVELS = {
 }
 # The level of the momentum where the method conserves it by construction.
 CONSERVED_MOMENTUM = 1e-6
-# Steps from rest of which half a step is much.
-_STARTING = 4
 # Rounding of a sum of a hundred terms at most, in units of its largest one.
 _ROUNDING = 100.0 * np.finfo(np.float64).eps
 # Nodes whose energies and momenta are compared, nodes of the inertia in the energy's unit, and steps taken back.
@@ -93,20 +91,14 @@ def momentum_error(scene: Scene, trajectory: Trajectory) -> float:
     return float(np.abs(trajectory.p[:, 0] - trajectory.p[0, 0]).max() / most) if most > 0.0 else math.nan
 
 
-def symmetric(integrator: Integrator) -> bool:
-    """Whether a method undoes its own steps."""
-    return isinstance(integrator, Gauss) or (isinstance(integrator, Midpoint) and integrator.alpha == 0.5)
-
-
 def reversal_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> float:
     """The distance from their start after the last steps are reversed, in units of the travel.
 
     Only of symmetric methods, where nothing drives or damps and no step is taken in parts.
     """
     k = min(_REVERSED, trajectory.steps)
-    if not (symmetric(integrator) and unforced(scene, trajectory) and k):
-        return math.nan
-    if (trajectory.statistics.substeps[-k:] > 1).any():
+    symmetric = isinstance(integrator, Gauss) or (isinstance(integrator, Midpoint) and integrator.alpha == 0.5)
+    if not (symmetric and unforced(scene, trajectory) and k) or (trajectory.statistics.substeps[-k:] > 1).any():
         return math.nan
     try:
         back = simulate(scene, trajectory.q[-1], -trajectory.v[-1], dt=trajectory.dt, steps=k, integrator=integrator)
@@ -138,46 +130,36 @@ def symplecticity_error(A: Floats) -> float:
 
 def linearized(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Floats:
     """A of some steps that were not taken in parts (K, 2n, 2n); of variational methods, where nothing damps."""
-    n = scene.robot.dof
-    nothing = np.zeros((0, 2 * n, 2 * n))
-    if not integrator.variational or not scene.conservative or trajectory.dw.any():
-        return nothing
+    found = [np.zeros((0, 2 * scene.robot.dof, 2 * scene.robot.dof))]
     whole = np.flatnonzero(trajectory.statistics.substeps == 1)
-    if not len(whole):
-        return nothing
-    found = []
-    for step in whole[_spread(len(whole) - 1, _FEW_NODES)]:
-        try:
-            found.append(linearize(scene, trajectory.part(int(step), int(step) + 1), integrator=integrator).A)
-        except LinearizationError:
-            continue
-    return np.concatenate(found) if found else nothing
+    if integrator.variational and scene.conservative and not trajectory.dw.any() and len(whole):
+        for step in whole[_spread(len(whole) - 1, _FEW_NODES)]:
+            with contextlib.suppress(LinearizationError):
+                found.append(linearize(scene, trajectory.part(int(step), int(step) + 1), integrator=integrator).A)
+    return np.concatenate(found)
 
 
 def record_error(scene: Scene, trajectory: Trajectory) -> float:
     """Largest distance of recorded momenta and energies from what Pinocchio makes of q and v.
 
-    Beyond what rounding leaves of them: of q, by which states differ that are one and the same, and of the levers about
-    joints far below, whose squares cancel in the inertias of what they carry.
+    Beyond what rounding leaves of the levers about joints far below, whose squares cancel in the inertias of what they
+    carry.
     """
     count = _NODES if scene.robot.dof <= 32 else 2
     worst = 0.0
     start = trajectory.energy[0] - _pinocchio(scene, trajectory.q[0], trajectory.v[0])[1]
     for k in _spread(trajectory.steps, count):
-        q, v = trajectory.q[k], trajectory.v[k]
-        momentum, energy, mass = _pinocchio(scene, q, v)
-        kinetic = 0.5 * v @ momentum
+        v = trajectory.v[k]
+        momentum, energy, mass = _pinocchio(scene, trajectory.q[k], v)
         # Energies are known up to a constant, which the first node tells.
-        scale = max(kinetic, abs(energy), 1e-3 * abs(trajectory.energy[0]))
+        scale = max(0.5 * v @ momentum, abs(energy), 1e-3 * abs(trajectory.energy[0]))
         units = np.append(np.abs(mass) @ np.abs(v), scale)
         off = np.append(np.abs(momentum - trajectory.p[k]), abs(trajectory.energy[k] - energy - start))
         speed = np.abs(v).sum()
-        sums = np.append(np.full(len(v), speed), speed**2)
-        rounding = _ROUNDING * np.diag(mass).max() * sums + _of_last_bits(scene, q, v)
+        rounding = _ROUNDING * np.diag(mass).max() * np.append(np.full(len(v), speed), speed**2)
         # What overflows on the way there, or is at rest to the last bit, is not comparable.
         known = (units > np.finfo(np.float64).tiny) & np.isfinite(units) & np.isfinite(rounding)
-        off = np.maximum(off - rounding, 0.0)
-        shares = off[known] / units[known]
+        shares = np.maximum(off - rounding, 0.0)[known] / units[known]
         worst = max(worst, float(np.nan_to_num(shares, nan=np.inf).max(initial=0.0)))
     return worst
 
@@ -189,13 +171,6 @@ def _pinocchio(scene: Scene, q: Floats, v: Floats) -> tuple[Floats, float, Float
     return jet.Lv, kinetic + (kinetic - float(jet.L)), jet.Lvv
 
 
-def _of_last_bits(scene: Scene, q: Floats, v: Floats) -> Floats:
-    """By how much momenta and energy of states differ that are apart by rounding of q (n + 1,)."""
-    spread = 2.0 * np.finfo(np.float64).eps
-    low, high = (_pinocchio(scene, q * (1.0 + sign * spread), v) for sign in (-1.0, 1.0))
-    return np.append(np.abs(high[0] - low[0]), abs(high[1] - low[1]))
-
-
 def finite(trajectory: Trajectory) -> bool:
     """Whether the record holds numbers only."""
     arrays: list[Any] = [trajectory.t, trajectory.q, trajectory.v, trajectory.p, trajectory.energy, trajectory.u]
@@ -204,14 +179,8 @@ def finite(trajectory: Trajectory) -> bool:
 
 def measures(scene: Scene, integrator: Integrator, trajectory: Trajectory, exact: Exact | None) -> dict[str, float]:
     """Every check of a motion by its name in :data:`LEVELS`."""
-    if (
-        exact is not None
-        and exact.cut
-        and integrator.order == 1
-        and exact.nodes[-1] < _STARTING
-        and not trajectory.v[0].any()
-    ):
-        # A motion that starts from rest lags by half a step: much of its short exact part, little of the whole motion.
+    if exact is not None and integrator.order == 1 and exact.nodes[-1] < START:
+        # From rest, such methods lag by half a step: much of few steps, little of the whole motion.
         exact = None
     with np.errstate(over="ignore", invalid="ignore"):
         A = linearized(scene, integrator, trajectory)

@@ -1,7 +1,7 @@
 """The exact motion of a scene, and the distance of an integrator's motion from it.
 
 The exact motion is LSODA's at 1e-11: it takes stiff dampers, and shares nothing with the integrator. From which error
-on a motion is wrong is in :data:`LEVELS` of :mod:`varpin.study.extremes`, in units of the motion itself.
+on a motion is wrong is in :data:`LEVELS` of :mod:`varpin.study.checks`, in units of the motion itself.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats
 from varpin.core import ForwardDynamics
 from varpin.integrators import ExplicitEuler, Integrator
-from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.simulation.spectrum import largest_of_its_kind, masses
@@ -28,9 +27,9 @@ _TOLERANCE = 1e-11
 _SLOWEST = 1e-3
 # Ways shorter than this count as it [rad or m].
 SHORTEST = 1e-6
-# Processor time for the motion of a window, which other programs do not change [s].
+# Processor time for an exact motion, which other programs do not change [s].
 PATIENCE = 3.0
-# Growth of a disturbance from which on a motion counts as unpredictable; and the disturbance, relative to q and v.
+# Growth of a disturbance from which on a motion counts as unpredictable; and the disturbance, relative to q.
 _PREDICTABLE, DISTURBANCE = 10.0, 1e-7
 # For a joint that hardly moves, the unit of errors is at least the smaller of two: this share of the largest travel or
 # speed among joints of its kind, and of the speed at which the joint would have their energy.
@@ -39,42 +38,6 @@ _LITTLE, _LIGHT = 1e-2, 1e-2
 _EVEN = 1e-3
 # Nodes of a window, and those at its start, where what is stiff dies out.
 NODES, START = 32, 4
-
-
-class EndsHereError(ArithmeticError):
-    """The exact motion goes no further, or takes too long."""
-
-
-def integrated(
-    dynamics: ForwardDynamics,
-    force: Floats,
-    x: Floats,
-    dt: float,
-    steps: int,
-    end: float,
-    beside: tuple[Scene, Floats] | None = None,
-) -> Floats:
-    """(q, v) after each of some steps (K, 2n) under one force, and one ``beside`` it that drives do not limit."""
-
-    def rate(_: float, x: Floats) -> Floats:
-        slope, regular = dynamics.rate(x, force)
-        if beside is not None:
-            slope[len(force) :] += np.linalg.solve(masses(beside[0], x[None, : len(force)])[0], beside[1])
-        if not (regular and np.isfinite(slope).all()) or time.process_time() > end:
-            raise EndsHereError
-        return slope
-
-    n = len(force)
-    speed = max(float(np.abs(x[n:]).max() + dt * np.abs(rate(0.0, x)[n:]).max()), _SLOWEST)
-    atol = _TOLERANCE * np.append(np.ones(n), np.full(n, speed))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", scipy.integrate.ODEintWarning)
-        states, report = scipy.integrate.odeint(
-            rate, x, dt * np.arange(steps + 1), rtol=_TOLERANCE, atol=atol, tfirst=True, mxstep=10**6, full_output=True
-        )
-    if report["message"] != "Integration successful.":
-        raise EndsHereError
-    return np.asarray(states[1:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +51,6 @@ class Exact:
         travel: Largest distance from the start [rad or m].
         travels: The same for each joint (n,) [rad or m].
         speeds: Largest velocity of each joint (n,) [rad/s or m/s].
-        cut: Whether it is known over a part of the window only.
     """
 
     nodes: NDArray[np.int64]
@@ -97,10 +59,9 @@ class Exact:
     travel: float
     travels: Floats
     speeds: Floats
-    cut: bool = False
 
     def errors(self, trajectory: Trajectory) -> dict[str, float]:
-        """Largest distances of a motion, NaN if it ends before the first node.
+        """Largest distances of a motion, none if it ends before the first node.
 
         ``error`` in q, in units of the travel; ``joint`` in q and ``velocity`` in v, each joint in units of its own
         travel and velocity, so that a far or fast joint does not hide the others.
@@ -116,74 +77,132 @@ class Exact:
         }
 
 
-def kicked(scene: Scene, x: Floats, u: Floats, dw: Floats, origin: Floats) -> Floats:
-    """A state (2n,) after the kick of a step's increments (k,); diffusion fields are relative to ``origin`` (n,)."""
-    q, v = np.split(x, 2)
-    return np.append(q, v + np.linalg.solve(masses(scene, q[None])[0], impulse(scene, x, u, dw, origin)))
+def before_step(integrator: Integrator) -> float | None:
+    """The part of the noise's kicks that comes before an integrator's steps; None where it is held over them."""
+    if integrator.holds_noise:
+        return None
+    return 0.0 if isinstance(integrator, ExplicitEuler) else integrator.left
 
 
-def impulse(scene: Scene, x: Floats, u: Floats, dw: Floats, origin: Floats) -> Floats:
-    """The impulse (n,) of a step's increments (k,) at a state (2n,), as for :func:`kicked`."""
-    q, v = np.split(x, 2)
-    force: Floats = scene.noise.fields(q[None], v[None], u[None], origin).F[0] @ dw
-    return force
+def nodes_of(steps: int, stride: int) -> NDArray[np.int64]:
+    """The nodes of a window that are compared: every ``stride``-th, and the first ones."""
+    return np.union1d(np.arange(1, min(steps, START) + 1), np.arange(stride, steps + 1, stride))
 
 
 def exact_motion(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, window: float, ahead: Floats | float = 0.0
+    scene: Scene,
+    q0: Floats,
+    v0: Floats,
+    u: Floats,
+    dw: Floats,
+    *,
+    dt: float,
+    left: float | None = 1.0,
+    ahead: Floats | float = 0.0,
 ) -> Exact | None:
-    """The exact motion from a trajectory's start over a window [s], as far as a small disturbance does not grow.
+    """The exact motion over a window, as far as a small disturbance does not grow; None where it has none.
 
-    Where q is ``ahead`` by whole turns it is computed without them. A kick comes before its step, or after the step of
-    the explicit Euler method, which does not know of it; an integrator that holds the noise has the impulse as a
-    constant force. None where it cannot be integrated over a single step.
+    Args:
+        scene: The scene.
+        q0: (n,) [rad or m].
+        v0: (n,) [rad/s or m/s].
+        u: Controls of each step (N, m).
+        dw: Increments of the Wiener processes (N, k).
+        dt: Time step [s].
+        left: As for :func:`path`.
+        ahead: Whole turns in q0, without which the motion is computed (n,) [rad].
     """
-    dt, steps = trajectory.dt, min(trajectory.steps, max(1, round(window / trajectory.dt)))
-    if not trajectory.steps:
+    if not len(u):
         return None
-    u, dw, q0, v0 = trajectory.u[:steps], trajectory.dw[:steps], trajectory.q[0] - ahead, trajectory.v[0]
-    # The first of the steps that each control is held for.
-    noisy, late, held = bool(dw.any()), isinstance(integrator, ExplicitEuler), integrator.holds_noise
-    first = np.flatnonzero(np.append(True, (u[1:] != u[:-1]).any(axis=1) | noisy))
-    if len(first) > 1:
-        steps = min(steps, 2 * NODES)
-    first, end = first[first < steps], time.process_time() + PATIENCE
-    dynamics, paths = ForwardDynamics(scene.core), []
-    for by in (0.0, DISTURBANCE):
-        states = np.append(q0 + by, v0)[None]
-        for begin, after in zip(first, np.append(first[1:], steps), strict=True):
-            x, force, given = states[-1], scene.actuation @ u[begin], (u[begin], dw[begin], trajectory.q[0])
-            beside = None
-            if noisy and held and limited_servos(scene.elements):
-                beside = scene, impulse(scene, x, *given) / dt
-            elif noisy and held:
-                force = force + impulse(scene, x, *given) / dt
-            elif noisy and not late:
-                x = kicked(scene, x, *given)
-            try:
-                more = integrated(dynamics, force, x, dt, int(after - begin), end, beside)
-            except EndsHereError:
-                break
-            if noisy and late:
-                more[-1] = kicked(scene, more[-1], *given)
-            states = np.concatenate([states, more])
-        paths.append(states)
-    known = min(map(len, paths))
-    if known < 2:
+    varying = bool(dw.any() or (u != u[:1]).any())
+    steps = min(len(u), 2 * NODES) if varying else len(u)
+    nodes = nodes_of(steps, 1 if varying else max(1, steps // NODES))
+    end, start, u, dw = time.process_time() + PATIENCE, q0 - ahead, u[:steps], dw[:steps]
+    plain, disturbed = (
+        path(scene, np.append(start + by, v0), u, dw, dt=dt, left=left, origin=q0, end=end) for by in (0.0, DISTURBANCE)
+    )
+    if not (known := grown(plain, disturbed, DISTURBANCE)):
         return None
-    plain, disturbed = (states[:known] for states in paths)
-    known = grown(plain[:, : len(q0)], disturbed[:, : len(q0)], DISTURBANCE)
-    stride = 1 if len(first) > 1 else max(1, steps // NODES)
-    nodes = np.union1d(np.arange(1, min(steps, START) + 1), np.arange(stride, steps + 1, stride))
     # At the last of the known steps the disturbance has grown already, if they are not all.
     count = int((nodes <= (known if known >= nodes[-1] else max(1, known - 1))).sum())
     q, v = np.split(plain[nodes[:count]], 2, axis=1)
-    return in_units(scene, trajectory.q[0], v0, dt, nodes[:count], q + ahead, v, cut=count < len(nodes))
+    return in_units(scene, q0, v0, dt, nodes[:count], q + ahead, v)
 
 
-def in_units(
-    scene: Scene, q0: Floats, v0: Floats, dt: float, nodes: NDArray[np.int64], q: Floats, v: Floats, *, cut: bool
-) -> Exact:
+def path(
+    scene: Scene, x: Floats, u: Floats, dw: Floats, *, dt: float, left: float | None, origin: Floats, end: float
+) -> Floats:
+    """States (K + 1, 2n) of the exact motion, the first itself, as far as it can be integrated.
+
+    Args:
+        scene: The scene.
+        x: q and v at first (2n,).
+        u: Controls of each step (N, m).
+        dw: Increments of the Wiener processes (N, k).
+        dt: Time step [s].
+        left: Part of each kick that comes before its step; the rest comes after it. None for a constant force over the
+            step instead.
+        origin: Configuration that diffusion fields are relative to (n,).
+        end: Processor time at which it ends [s].
+    """
+    dynamics, noisy, states = ForwardDynamics(scene.core), bool(dw.any()), x[None]
+    # The first of the steps that each control is held for.
+    first = np.flatnonzero(np.append(True, (u[1:] != u[:-1]).any(axis=1) | noisy)).tolist()
+
+    def impulse(x: Floats, step: int) -> Floats:
+        q, v = np.split(x[None], 2, axis=1)
+        force: Floats = scene.noise.fields(q, v, u[step][None], origin).F[0] @ dw[step]
+        return force
+
+    def kicked(x: Floats, step: int, part: float) -> Floats:
+        q, v = np.split(x, 2)
+        return np.append(q, v + part * np.linalg.solve(masses(scene, q[None])[0], impulse(x, step)))
+
+    for begin, after in zip(first, [*first[1:], len(u)], strict=True):
+        x, force = states[-1], scene.actuation @ u[begin]
+        if noisy and left is None:
+            force = force + impulse(x, begin) / dt
+        elif noisy and left:
+            x = kicked(x, begin, left)
+        more = _integrated(dynamics, force, x, dt, after - begin, end)
+        if more is None:
+            break
+        if noisy and left is not None and left < 1.0:
+            more[-1] = kicked(more[-1], begin, 1.0 - left)
+        states = np.concatenate([states, more])
+    return states
+
+
+class _EndsHereError(ArithmeticError):
+    """The exact motion goes no further, or takes too long."""
+
+
+def _integrated(
+    dynamics: ForwardDynamics, force: Floats, x: Floats, dt: float, steps: int, end: float
+) -> Floats | None:
+    """(q, v) after each of some steps (K, 2n) under one force; None where it cannot be integrated."""
+
+    def rate(_: float, x: Floats) -> Floats:
+        slope, regular = dynamics.rate(x, force)
+        if not (regular and np.isfinite(slope).all()) or time.process_time() > end:
+            raise _EndsHereError
+        return slope
+
+    n, times = len(force), dt * np.arange(steps + 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", scipy.integrate.ODEintWarning)
+        try:
+            speed = max(float(np.abs(x[n:]).max() + dt * np.abs(rate(0.0, x)[n:]).max()), _SLOWEST)
+            atol = _TOLERANCE * np.append(np.ones(n), np.full(n, speed))
+            states, report = scipy.integrate.odeint(
+                rate, x, times, rtol=_TOLERANCE, atol=atol, tfirst=True, mxstep=10**6, full_output=True
+            )
+        except _EndsHereError:
+            return None
+    return np.asarray(states[1:]) if report["message"] == "Integration successful." else None
+
+
+def in_units(scene: Scene, q0: Floats, v0: Floats, dt: float, nodes: NDArray[np.int64], q: Floats, v: Floats) -> Exact:
     """An exact motion with travels and speeds: each joint's own, or a small share of the others'."""
     velocities = np.vstack([v0, v])
     travels, speeds = np.abs(q - q0).max(axis=0), np.abs(velocities).max(axis=0)
@@ -194,14 +213,16 @@ def in_units(
     least_travel = np.minimum(_LITTLE * largest_of_its_kind(scene, travels), light * float(nodes[-1]) * dt)
     travel = max(float(travels.max()), SHORTEST)
     travels, speeds = np.maximum(travels, least_travel), np.maximum(speeds, least)
-    return Exact(nodes, q, v, travel, np.maximum(travels, SHORTEST), np.maximum(speeds, SHORTEST), cut)
+    return Exact(nodes, q, v, travel, np.maximum(travels, SHORTEST), np.maximum(speeds, SHORTEST))
 
 
 def grown(plain: Floats, disturbed: Floats, disturbance: float) -> int:
-    """Steps, one at least, until the distance of two motions' q (K + 1, n) is a multiple of the disturbance."""
+    """Steps until the distance of two motions in q, each (K + 1, 2n), is a multiple of the disturbance."""
+    known, n = min(len(plain), len(disturbed)), plain.shape[1] // 2
     with np.errstate(over="ignore", invalid="ignore"):
-        apart = ~(np.abs(disturbed - plain).max(axis=1) <= _PREDICTABLE * disturbance)
-    return max(1, int(apart.argmax())) if apart.any() else len(plain) - 1
+        off = np.abs(disturbed[:known, :n] - plain[:known, :n]).max(axis=1)
+        apart = ~(off <= _PREDICTABLE * disturbance)
+    return int(apart.argmax()) if apart.any() else known - 1
 
 
 def velocity_change(v: Floats) -> Floats:

@@ -25,7 +25,7 @@ from varpin.simulation import limits
 from varpin.simulation.failures import Interrupted
 from varpin.simulation.simulate import simulate
 from varpin.study.checks import LEVELS, condition, findings, finite, measures
-from varpin.study.exact import exact_motion
+from varpin.study.exact import before_step, exact_motion
 from varpin.study.record import Progress, Study, collect
 from varpin.support.checks import positive
 from varpin.trajectory import Trajectory
@@ -82,7 +82,6 @@ class Cell:
         error: Largest distance in q from the exact motion over its window, in units of how far that goes.
         joint: The same distance, each joint in units of its own travel.
         velocity: The same of v, in units of each joint's largest velocity.
-        period: Largest error over a period from any of many nodes of the whole motion, in units of what is wrong.
         energy: Largest error of the energy balance, in units of the energy there is to turn over.
         momentum: Largest change of the momentum that is to be conserved, in units of the largest one.
         reversal: Distance in q from where the reversed motion is to end, as a share of the joint travel.
@@ -101,7 +100,6 @@ class Cell:
     error: float
     joint: float
     velocity: float
-    period: float
     energy: float
     momentum: float
     reversal: float
@@ -112,26 +110,6 @@ class Cell:
     done: int
     steps: int
     seconds: float
-
-    @property
-    def needless(self) -> bool:
-        """Whether it warns although no check finds anything: a false alarm."""
-        return self.kind is Kind.DEGRADED and not self.found
-
-    def measures(self) -> dict[str, float]:
-        """The measures by name."""
-        return {name: getattr(self, name) for name in LEVELS}
-
-    def __str__(self) -> str:
-        """The kind's letter with the error, or E with that of the energy where no exact motion is known; the steps."""
-        known = self.error if not math.isnan(self.error) else self.energy
-        error = (
-            "" if math.isnan(known) else f" {'E ' if math.isnan(self.error) else ''}{f'{known:.0e}' if known else 0}"
-        )
-        if self.kind in (Kind.REFUSED, Kind.STOPPED):
-            error = ""
-        steps = "" if self.done == self.steps or self.kind is Kind.REFUSED else f" {self.done}/{self.steps}"
-        return self.kind.letter + error + steps
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -180,10 +158,6 @@ class Record(Study[Cell]):
     def wrong(self) -> tuple[Cell, ...]:
         """The motions that are wrong without a warning."""
         return tuple(cell for cell in self.runs if cell.kind is Kind.WRONG)
-
-    def needless(self) -> tuple[Cell, ...]:
-        """The motions with a warning although every check passes: false alarms."""
-        return tuple(cell for cell in self.runs if cell.needless)
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,7 +292,9 @@ def _cell(motion: Motion, integrator: Integrator, patience: float) -> Cell:
     except Exception as fault:
         kind, wrong = Kind.WRONG, (f"unnamed error: {line_of(fault)}",)
     else:
-        exact = exact_motion(scene, integrator, trajectory, motion.window, motion.ahead)
+        window = slice(max(1, round(motion.window / motion.dt)))
+        u, dw, left = trajectory.u[window], trajectory.dw[window], before_step(integrator)
+        exact = exact_motion(scene, motion.q0, motion.v0, u, dw, dt=motion.dt, left=left, ahead=motion.ahead)
         found, done = measures(scene, integrator, trajectory, exact), trajectory.steps
         kind, said, wrong = judge(trajectory, error, findings(found, integrator, condition(scene, motion.q0)))
     return Cell(

@@ -212,36 +212,6 @@ def Terminal(cost: Cost) -> Cost:
     return _sum([term.changed(at_end=True) for term in cost.terms])
 
 
-class Terms:
-    """Costs weight . r^2 that the core evaluates all at once, at the same points."""
-
-    def __init__(self, dof: int, controls: int) -> None:
-        self.core = CostTerms.make(dof, controls)
-        self.count = 0
-        self._places: dict[bytes, int] = {}
-
-    def add(self, term: BoundTerm, factor: float) -> None:
-        """Add ``factor`` times a term. The frame of several terms is placed once."""
-        place = term.of
-        if not isinstance(place, int):
-            if place.key not in self._places:
-                added = (
-                    self.core.add_center(place.core)
-                    if isinstance(place, Links)
-                    else self.core.add_frame(place.links.core, place.rotation, place.translation)
-                )
-                self._places[place.key] = added
-            place = self._places[place.key]
-        self.core.add_term(term.subject, place, factor * term.weight, term.target, term.directions)
-        self.count += 1
-
-    def values(self, q: Floats, v: Floats, u: Floats) -> Floats:
-        """The value of each term (..., N, terms) at q (..., N, n), v (..., N, n) and u (..., N, m)."""
-        rows = (np.ascontiguousarray(x).reshape(-1, x.shape[-1]) for x in (q, v, u))
-        found = self.core.values(*rows)
-        return found.reshape(*q.shape[:-1], found.shape[1])
-
-
 @dataclass(frozen=True, eq=False)
 class BoundTerm(BoundCost):
     """weight . r^2 with r what a ``subject`` of the core is beside its target.
@@ -283,13 +253,29 @@ class BoundSum(BoundCost):
     points: Points
 
     @cached_property
-    def compiled(self) -> Terms:
-        """The terms that the core evaluates."""
-        terms = Terms(self.points.dof, self.points.controls)
+    def core(self) -> CostTerms:
+        """The terms weight . r^2, which the core evaluates all at once. The frame of several terms is placed once."""
+        terms, places = CostTerms.make(self.points.dof, self.points.controls), dict[bytes, int]()
         for factor, part in self.parts:
-            if isinstance(part, BoundTerm):
-                terms.add(part, factor)
+            if not isinstance(part, BoundTerm):
+                continue
+            of = part.of
+            if not isinstance(of, int):
+                if of.key not in places:
+                    added = (
+                        terms.add_center(of.core)
+                        if isinstance(of, Links)
+                        else terms.add_frame(of.links.core, of.rotation, of.translation)
+                    )
+                    places[of.key] = added
+                of = places[of.key]
+            terms.add_term(part.subject, of, factor * part.weight, part.target, part.directions)
         return terms
+
+    def compiled(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """The value of each term of the core (..., N, terms) at q (..., N, n), v (..., N, n) and u (..., N, m)."""
+        found = self.core.values(*(np.ascontiguousarray(x).reshape(-1, x.shape[-1]) for x in (q, v, u)))
+        return found.reshape(*q.shape[:-1], found.shape[1])
 
     @cached_property
     def others(self) -> tuple[tuple[float, BoundCost], ...]:
@@ -298,7 +284,7 @@ class BoundSum(BoundCost):
 
     def shares(self, q: Floats, v: Floats, u: Floats) -> list[Floats]:
         """The values of all terms, which add up: arrays (..., N, terms) and (..., N)."""
-        return [self.compiled.values(q, v, u), *(factor * part.value(q, v, u) for factor, part in self.others)]
+        return [self.compiled(q, v, u), *(factor * part.value(q, v, u) for factor, part in self.others)]
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """See :meth:`BoundCost.value`."""
@@ -310,7 +296,7 @@ class BoundSum(BoundCost):
 
     def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
         """See :meth:`BoundCost.expand`."""
-        gradient, hessian = self.compiled.core.expand(q, v, u)
+        gradient, hessian = self.core.expand(q, v, u)
         for factor, part in self.others:
             expansion = part.expand(q, v, u)
             # A cost of one's own may be anything, and NumPy would broadcast it.

@@ -11,7 +11,7 @@ from varpin.arrays import Floats
 from varpin.control.costs.base import BoundCost, Cost, CostSum, Points
 from varpin.control.costs.least_squares import LeastSquares, checked_weight, plain, weight_matrix
 from varpin.errors import InputError
-from varpin.support.checks import JointValues, as_floats, control_array, control_values, require_finite
+from varpin.support.checks import JointValues, as_floats, control_array, control_values
 from varpin.support.frozen import Frozen
 
 
@@ -36,11 +36,12 @@ class ControlRateCost(LeastSquares):
                 the first control is free.
 
         Raises:
-            InputError: A weight that is not finite, indefinite, or neither number, vector nor square matrix; or a
-                control that is neither number nor vector, or not finite.
+            InputError: A weight that is not finite, indefinite, or neither number, vector nor square matrix.
         """
         self.weight = weight if isinstance(weight, Mapping) else checked_weight("ControlRateCost", weight)
-        self.before = before if before is None or isinstance(before, Mapping) else _number_or_vector(before)
+        self.before = (
+            before if before is None or isinstance(before, Mapping) else as_floats("ControlRateCost before", before)
+        )
 
     def _text(self) -> str:
         own = super()._text()
@@ -90,14 +91,6 @@ class ControlRate(Frozen):
         first = u[..., :1, :]
         changes: Floats = np.diff(u, axis=-2, prepend=first if self.before is None else first * 0.0 + self.before)
         return changes
-
-
-def _number_or_vector(before: JointValues) -> Floats:
-    start = require_finite("ControlRateCost before", as_floats("ControlRateCost before", before))
-    if start.ndim > 1:
-        raise InputError(f"ControlRateCost before must be one number or a vector, got shape {start.shape}")
-    start.setflags(write=False)
-    return start
 
 
 def control_rate(cost: Cost, controls: int, joints: Sequence[str] | None = None) -> ControlRate | None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import meshcat
@@ -11,21 +11,62 @@ import numpy as np
 from meshcat.animation import Animation, AnimationClip, AnimationTrack
 
 from varpin.arrays import Floats
-from varpin.errors import InputError
+from varpin.model import Robot
 from varpin.show.replay.marks import Figure, Mark, Region, samples, translation
 from varpin.show.replay.picture import Picture, label
-from varpin.show.replay.script import Actor, Script
 from varpin.show.replay.shapes import ShapeLoader
 from varpin.show.replay.view import across, set_view, side_by_side, view_direction
 
-# Largest coordinate [m]: viewers compute squares in single precision.
-_FARTHEST = 1e18
 # Part of a region that is shown around the rest, relative to the size of a robot's motion.
 _AROUND = 0.3
 # Colours of no torque, half of the limit and the whole limit; linear in between.
 EFFORT_COLORS = np.array([[0.72, 0.76, 0.8], [0.98, 0.75, 0.1], [0.8, 0.05, 0.05]])
 
-logger = logging.getLogger(__name__)
+
+@dataclass(frozen=True, eq=False)
+class Actor:
+    """A robot that moves.
+
+    Attributes:
+        robot: The robot.
+        motions: Configurations at the keyframes (K, n) [rad or m], by "robot" and, if there is one, "ghost".
+        marks: What is drawn beside it.
+        effort: Torque of each joint of the tree as a share of its limit at the keyframes (K, b), in [0, 1]; None for
+            the robot in its own colours.
+    """
+
+    robot: Robot
+    motions: Mapping[str, Floats]
+    marks: tuple[Mark, ...] = ()
+    effort: Floats | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Script:
+    """The contents of a replay.
+
+    Attributes:
+        times: Times of the keyframes (K,) [s of playback]. All tracks share them: each track loops on its own, and
+            tracks of unequal length would drift apart.
+        actors: The robots.
+        speed: Seconds of motion in a second of playback.
+        error: The estimated error of the motions in words; empty where it is not known.
+    """
+
+    times: Floats
+    actors: tuple[Actor, ...]
+    speed: float = 1.0
+    error: str = ""
+
+    @property
+    def marks(self) -> list[Mark]:
+        """The marks of all robots."""
+        return [mark for actor in self.actors for mark in actor.marks]
+
+    @property
+    def title(self) -> str:
+        """The names of the robots."""
+        return ", ".join(dict.fromkeys(actor.robot.name for actor in self.actors))
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,24 +86,23 @@ class Stage:
     figures: list[Figure]
 
 
-def draw(viewer: meshcat.Visualizer, script: Script, *, legend: bool = False) -> Stage:
-    """Send a script to a viewer.
+def draw(viewer: meshcat.Visualizer, script: Script) -> Stage:
+    """Send a script to a viewer."""
+    return _Drawing(viewer, script).draw()
 
-    Args:
-        viewer: The viewer.
-        script: The script.
-        legend: Whether a legend beside the picture names the targets: a single one then has no label.
-    """
-    return _Drawing(viewer, script, legend=legend).draw()
+
+def tree_positions(robot: Robot, q: Floats) -> Floats:
+    """Positions (K, b) [rad or m] of all joints of the tree, mimic joints included, at configurations (K, n)."""
+    tree = robot.tree
+    return np.asarray(q[:, tree.coordinate] * tree.ratio + tree.offset)
 
 
 class _Drawing:
     """The drawing of one script in one viewer."""
 
-    def __init__(self, viewer: meshcat.Visualizer, script: Script, *, legend: bool) -> None:
+    def __init__(self, viewer: meshcat.Visualizer, script: Script) -> None:
         self.viewer = viewer
         self.script = script
-        self.labelled = not legend or len({mark.name for mark in script.marks if mark.kind == "target"}) > 1
         self.loader = ShapeLoader(viewer)
         self.clips: dict[meshcat.path.Path, AnimationClip] = {}
         robots = {id(actor.robot): actor.robot for actor in script.actors}
@@ -85,22 +125,18 @@ class _Drawing:
         pictures = [self.pictures[id(actor.robot)] for actor in self.script.actors]
         swept, axes, size = [], [], 0.0
         for actor, picture in zip(self.script.actors, pictures, strict=True):
-            reach = [] if actor.reach is None else [actor.reach]
-            positions = np.concatenate([*map(samples, actor.positions.values()), *reach])
-            swept.append(picture.swept(positions))
+            q = np.concatenate([*map(samples, actor.motions.values())])
+            swept.append(picture.swept(q))
             size = max(size, float(np.ptp(swept[-1], axis=0).max()))
-            axes.append(picture.body_poses(positions)[0][..., 2].reshape(-1, 3))
-        # The camera is one metre away from a point or anything of negligible size.
-        size = size if size > 1.0 / _FARTHEST else 1.0
+            axes.append(picture.body_poses(q)[0][..., 2].reshape(-1, 3))
+        size = size or 1.0
         toward = view_direction(np.concatenate(axes))
         plane = across(toward), np.cross(toward, across(toward))
         figures = [
-            Figure(picture, actor.positions["robot"], size, self.labelled, plane, points)
+            Figure(picture, actor.motions["robot"], size, plane, points)
             for actor, picture, points in zip(self.script.actors, pictures, swept, strict=True)
         ]
         extents = [self._extent(actor, figure) for actor, figure in zip(self.script.actors, figures, strict=True)]
-        if not np.abs(np.concatenate(extents)).max() < _FARTHEST:
-            raise InputError(f"the replay has sizes or positions beyond {_FARTHEST:g} m, which no viewer draws")
         places = side_by_side(extents, toward)
         points = np.concatenate([points + place for points, place in zip(extents, places, strict=True)])
         set_view(self.viewer, points, toward, size)
@@ -116,8 +152,8 @@ class _Drawing:
 
     def _robot(self, actor: Actor, picture: Picture, number: str, place: Floats) -> None:
         tree = actor.robot.tree
-        for kind, rows in actor.positions.items():
-            root = f"{kind}{number}"
+        for kind, q in actor.motions.items():
+            root, rows = f"{kind}{number}", tree_positions(actor.robot, q)
             self.viewer[root].set_transform(translation(place))
             nodes = picture.moving_nodes(root)
             for j, node in enumerate(nodes):
@@ -145,9 +181,6 @@ class _Drawing:
         self._animate(node, "material.color", "color", colors)
 
     def _mark(self, mark: Mark, name: str, figure: Figure, number: str) -> None:
-        if isinstance(mark, Region) and not np.abs(mark.around(figure)).max() < _FARTHEST:
-            logger.warning("%s %r is too large for viewers and is left out", mark.kind, mark.name)
-            return
         for item in mark.items(figure):
             node = mark_node(figure.picture, name, item.node, item.body, number)
             if item.form is not None:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import meshcat
 import numpy as np
@@ -27,14 +27,11 @@ from varpin.mechanics.scene import Scene
 from varpin.model import Robot
 from varpin.show.given import frame_names
 from varpin.show.replay import forms
-from varpin.show.replay.annotations import references, target, target_tracks
-from varpin.show.replay.drawing import draw, joint_motion, mark_name, mark_node
-from varpin.show.replay.marks import KINDS, LABEL, TUBE, Mark, Tie, Triad, translation
-from varpin.show.replay.motion import require_marks
-from varpin.show.replay.page import lowered, open_browser
+from varpin.show.replay.annotations import references, require_marks, rows_at, surroundings
+from varpin.show.replay.drawing import Actor, Script, draw, joint_motion, mark_name, mark_node, tree_positions
+from varpin.show.replay.marks import KINDS, LABEL, TUBE, Tie, translation
+from varpin.show.replay.page import open_browser
 from varpin.show.replay.picture import label
-from varpin.show.replay.script import Actor, Script, rows_at, tree_positions
-from varpin.show.replay.surroundings import goals, parts_of, regions, ties
 from varpin.show.replay.view import set_view
 from varpin.support.checks import flag, positive
 from varpin.trajectory import Nodes
@@ -55,8 +52,6 @@ _TEXT_INTERVAL = 0.1
 _TRACE, _BETWEEN = 400, 50
 # Shortest distance of points of a path, and how far bodies may leave the view, relative to the size of the robot.
 _APART, _EDGE = 0.004, 0.1
-# Random postures that give the reach of a robot for the view, and their largest angle from the start [rad].
-_POSTURES, _TURN = 40, np.pi
 
 
 class LiveView:
@@ -67,8 +62,7 @@ class LiveView:
 
     ``progress`` shows the motion of :func:`varpin.simulate` or :meth:`varpin.Mpc.run` up to the present, at most at
     true speed: where computing is faster, it waits. Nothing waits while no browser is connected. At first the robot is
-    in its initial configuration and the camera shows all that it can reach; the camera moves back if that is not
-    enough.
+    in its initial configuration; the camera moves back as its motion needs.
 
     The server belongs to this process. It ends with :meth:`close`, with the ``with`` block or with the process; the
     browser keeps its last picture. The server listens on every network interface of the machine, as meshcat's always
@@ -138,25 +132,9 @@ class LiveView:
 
     def _actor(self, source: object, marks: Marks) -> Actor:
         """The robot at its start, with its marks."""
-        robot = self.robot
-        given = marks.constraints
-        scene, wanted, begin = parts_of(source if given is True and source is not robot else given, None, robot)
-        standing = regions(wanted, np.array([begin]))
-        if moving := [region.name for region in standing if region.way is not None]:
-            logger.warning("a LiveView shows %s where it is at t = %g s; replays move it", " and ".join(moving), begin)
-        targets = [target(name, track, np.zeros(1)) for name, track in target_tracks(marks.targets, 0.0).items()]
-        frames = map(Triad, frame_names("frames", [robot], marks.frames)[0])
-        held = ties(scene)
-        every: tuple[Mark, ...] = (
-            *held,
-            *references(marks.reference),
-            *frames,
-            *standing,
-            *targets,
-            *goals(wanted, targets),
-        )
-        reach = None if held else tree_positions(robot, _postures(robot, self._q))
-        return Actor(robot, {"robot": tree_positions(robot, self._q[None])}, every, reach=reach)
+        robot, frames = self.robot, frame_names("frames", [self.robot], marks.frames)[0]
+        around = surroundings(robot, marks, frames, source, np.zeros(1), 0.0)
+        return Actor(robot, {"robot": self._q[None]}, (*references(marks.reference), *around))
 
     def __enter__(self) -> Self:
         return self
@@ -280,7 +258,7 @@ class LiveView:
             if positions[j] != before[j] or self._shown == -math.inf:
                 self._viewer[node].set_transform(joint_motion(bool(tree.prismatic[j]), positions[j]))
         self._q = row[0]
-        figure = replace(self._figure, positions=positions[None])
+        figure = replace(self._figure, q=row)
         for name, tie in self._ties.items():
             for rod in tie.rod(figure):
                 self._viewer[mark_node(figure.picture, name, rod.node)].set_transform(rod.pose)
@@ -295,7 +273,7 @@ class LiveView:
         # Twice as far as necessary, so that the camera does not move with every picture.
         out = points + np.where(points > high, points - high, 0.0) - np.where(points < low, low - points, 0.0)
         self._in_view = np.concatenate([self._in_view, points, out])
-        set_view(self._viewer, self._in_view, self._stage.toward, self._stage.size)
+        set_view(self._viewer, self._in_view, self._stage.toward, self._stage.size, camera=False)
 
     def _draw_path(self, q: Floats) -> None:
         """Extend the paths of the traced frames over configurations (k, n)."""
@@ -351,12 +329,6 @@ class _Window(ViewerWindow):
         self.zmq_socket.setsockopt(zmq.LINGER, 0)
         self.zmq_socket.connect(self.zmq_url)
 
-    def send(self, command: Any) -> None:
-        """Send a command, and wait until the server has accepted it."""
-        words = lowered(command)
-        self.zmq_socket.send_multipart([words["type"].encode(), words["path"].encode(), umsgpack.packb(words)])
-        self.zmq_socket.recv()
-
     def _listen(self) -> None:
         for line in self.server_proc.stderr:
             if line.startswith(b"opened:"):
@@ -381,13 +353,3 @@ class _Window(ViewerWindow):
         self.zmq_socket.close()
         self.server_proc.kill()
         self.server_proc.wait()
-
-
-def _postures(robot: Robot, start: Floats) -> Floats:
-    """Random configurations (S, n) [rad or m] around ``start``, within the limits."""
-    lower, upper = robot.position_limits
-    turn = np.where(robot.slides, 0.0, _TURN)
-    low = np.where(robot.slides & np.isfinite(lower), lower, np.maximum(lower, start - turn))
-    high = np.where(robot.slides & np.isfinite(upper), upper, np.minimum(upper, start + turn))
-    shares = np.random.default_rng(0).random((_POSTURES, robot.dof))
-    return np.asarray(low + shares * (high - low))

@@ -61,24 +61,22 @@ class Figure:
 
     Attributes:
         picture: The robot's shapes.
-        positions: Positions of the joints of the tree at the keyframes (K, b) [rad or m].
+        q: Configurations at the keyframes (K, n) [rad or m].
         size: Size of a robot's motion [m].
-        labelled: Whether targets have labels.
         axes: Unit vectors (3,) to the right and upwards as the camera sees them.
         swept: Points (P, 3) around the robot's motion [m].
     """
 
     picture: Picture
-    positions: Floats
+    q: Floats
     size: float
-    labelled: bool
     axes: tuple[Floats, Floats]
     swept: Floats
 
     @cached_property
     def poses(self) -> tuple[Floats, Floats]:
         """World rotations (K, b, 3, 3) and positions (K, b, 3) [m] of the bodies."""
-        return self.picture.body_poses(self.positions)
+        return self.picture.body_poses(self.q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,11 +149,9 @@ class Target:
     def around(self, figure: Figure) -> Floats:
         """Points around the ball and the label."""
         right, up = figure.axes
-        offsets = [-_BALL * figure.size * up, _BALL * figure.size * up]
-        if figure.labelled:
-            half = 0.5 * forms.label_width(self.name) * LABEL * figure.size * right
-            bottom = (1.2 * _BALL + LABEL) * figure.size * up
-            offsets += [-bottom - half, -bottom + half]
+        half = 0.5 * forms.label_width(self.name) * LABEL * figure.size * right
+        bottom = (1.2 * _BALL + LABEL) * figure.size * up
+        offsets = [_BALL * figure.size * up, -bottom - half, -bottom + half]
         return np.concatenate([self.places + offset for offset in offsets])
 
     def items(self, figure: Figure) -> Iterator[Item]:
@@ -169,9 +165,8 @@ class Target:
         yield Item("ball", forms.ball(_BALL * figure.size, KINDS[self.kind][1]))
         if self.turns is not None:
             yield Item("axes", forms.triad(_TRIAD * figure.size))
-        if figure.labelled:
-            # The tool comes to a target from above or from the side.
-            yield Item("label", forms.Label(self.name, LABEL * figure.size, -1.2 * _BALL * figure.size))
+        # The tool comes to a target from above or from the side.
+        yield Item("label", forms.Label(self.name, LABEL * figure.size, -1.2 * _BALL * figure.size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +186,7 @@ class Triad:
         tips = place + _TRIAD * figure.size * rotation.T
         if body < 0:
             return tips
-        R, p = figure.picture.body_poses(samples(figure.positions))
+        R, p = figure.picture.body_poses(samples(figure.q))
         return np.asarray((tips @ R[:, body].transpose(0, 2, 1) + p[:, body, None]).reshape(-1, 3))
 
     def items(self, figure: Figure) -> Iterator[Item]:

@@ -20,11 +20,19 @@ from varpin.errors import InputError
 from varpin.marks import Marks
 from varpin.model import Robot
 from varpin.show.given import frame_names, motion_of
-from varpin.show.replay.annotations import beads, paths, references, target, target_tracks, torque_shares
-from varpin.show.replay.marks import Mark, Triad
+from varpin.show.replay.annotations import (
+    beads,
+    paths,
+    references,
+    require_marks,
+    rows_at,
+    surroundings,
+    target_rows,
+    torque_shares,
+)
+from varpin.show.replay.drawing import Actor, Script
+from varpin.show.replay.marks import Mark
 from varpin.show.replay.page import Inline, inline_page, open_viewer, write_page
-from varpin.show.replay.script import Actor, Script, rows_at, tree_positions
-from varpin.show.replay.surroundings import goals, parts_of, regions, ties
 from varpin.show.replay.video import check_film, frame_size, frame_times, write_film
 from varpin.support.checks import as_floats, flag, positive, require_finite, writable
 from varpin.trajectory import Trajectory
@@ -170,14 +178,12 @@ class _Figure:
             raise InputError(f"the motion is a single pose, so its ghost must be one row, too, got {len(q)}")
         return np.linspace(0.0, end, len(q)), q
 
-
-def require_marks(marks: Marks | None) -> Marks:
-    """The marks, or none; raises an InputError for anything else."""
-    if marks is not None and not isinstance(marks, Marks):
-        raise InputError(f"marks must be varpin.Marks(...), such as Marks(trace=True), got {reprlib.repr(marks)}")
-    marks = Marks() if marks is None else marks
-    flag("growing", marks.growing)
-    return marks
+    def times(self, end: float) -> list[Floats]:
+        """The times of everything that moves [s]: the robot, its ghost, its targets."""
+        targets = target_rows(self.marks.targets, self.t[-1]).values()
+        moving = [np.linspace(0.0, self.t[-1], len(places)) for places, _ in targets if len(places) > 1]
+        ghost = self.ghost(end)
+        return [self.t, *moving, *([] if ghost is None else [ghost[0]])]
 
 
 def _figures(robot: Robot | Sequence[Shown], motion: Motion | None, dt: float | None, marks: Marks) -> list[_Figure]:
@@ -204,43 +210,42 @@ def _figures(robot: Robot | Sequence[Shown], motion: Motion | None, dt: float | 
     steps = [motion_of(figure.given) for figure in found]
     if dt is not None and all(isinstance(path, Trajectory) for path in steps):
         raise InputError(f"dt belongs to an array of configurations; this trajectory has its own, {steps[0].dt:g} s")
+    if any(figure.marks.ahead is not None for figure in found) and not any(figure.run for figure in found):
+        raise InputError("ahead needs a run of an Mpc with its plans; the motion is not one")
     return found
 
 
 def _keyframes(figures: Sequence[_Figure], fps: float, speed: float) -> tuple[Floats, tuple[Actor, ...]]:
     """Times of the keyframes (K,) [s of playback], and the robots at them."""
     end = max(figure.t[-1] for figure in figures)
-    ghosts = [figure.ghost(end) for figure in figures]
-    records = {id(figure.marks): figure.marks for figure in figures}
-    tracks = {key: target_tracks(marks.targets, end) for key, marks in records.items()}
-    moving = [t for own in tracks.values() for t, _, _ in own.values() if len(t) > 1]
-    moving += [second[0] for second in ghosts if second is not None]
-    times = _times([*(figure.t for figure in figures), *moving], end, fps / speed)
+    times = _times([t for figure in figures for t in figure.times(end)], end, fps / speed)
     _warn_if_thinned(figures, times)
-    actors = []
-    for figure, second in zip(figures, ghosts, strict=True):
-        robot, marks, t = figure.robot, figure.marks, figure.t
-        group = [other for other in figures if other.marks is marks]
-        if marks.ahead is not None and not any(other.run for other in group):
-            raise InputError("ahead needs a run of an Mpc with its plans; the motion is not one")
-        robots, place = [other.robot for other in group], group.index(figure)
-        traced = frame_names("trace", robots, marks.trace)[place]
-        clock = times if marks.growing else None
-        targets = tuple(target(name, track, times) for name, track in tracks[id(marks)].items())
-        own: list[Mark] = [*references(marks.reference), *paths("motion", robot, traced, t, figure.q, end, clock)]
-        positions = {"robot": tree_positions(robot, rows_at(times, t, figure.q))}
-        if second is not None:
-            positions["ghost"] = tree_positions(robot, rows_at(times, *second))
-            # The planned configurations of a run jump from plan to plan and have no trace.
-            own += paths("ghost", robot, traced, *second, end, clock) if marks.ghost is not None else []
-        if figure.run is not None and figure.ahead:
-            own += beads(robot, traced, figure.run, figure.ahead, np.minimum(times, t[-1]))
-        own += map(Triad, frame_names("frames", robots, marks.frames)[place])
-        scene, wanted, begin = parts_of(marks.constraints, figure.run or figure.given, robot)
-        own += [*ties(scene), *regions(wanted, begin + np.minimum(times, t[-1])), *targets, *goals(wanted, targets)]
-        effort = _efforts(robot, torque_shares(robot, figure.given, marks), t[-1], times)
-        actors.append(Actor(robot, positions, tuple(own), effort))
-    return times / speed, tuple(actors)
+    robots = [figure.robot for figure in figures]
+    return times / speed, tuple(_actor(figure, robots, k, times) for k, figure in enumerate(figures))
+
+
+def _actor(figure: _Figure, robots: Sequence[Robot], k: int, times: Floats) -> Actor:
+    """The k-th of the robots with its marks at the keyframes (K,) [s]."""
+    robot, marks, t, end = figure.robot, figure.marks, figure.t, times[-1]
+    ghost, own_times = figure.ghost(end), np.minimum(times, t[-1])
+    traced, frames = (frame_names(name, robots, getattr(marks, name))[k] for name in ("trace", "frames"))
+    clock = times if marks.growing else None
+    own: list[Mark] = [*references(marks.reference), *paths("motion", robot, traced, t, figure.q, end, clock)]
+    motions = {"robot": rows_at(times, t, figure.q)}
+    if ghost is not None:
+        motions["ghost"] = rows_at(times, *ghost)
+        # The planned configurations of a run jump from plan to plan and have no trace.
+        own += paths("ghost", robot, traced, *ghost, end, clock) if marks.ghost is not None else []
+    if figure.run is not None and figure.ahead:
+        own += beads(robot, traced, figure.run, figure.ahead, own_times)
+    own += surroundings(robot, marks, frames, figure.given, own_times, t[-1])
+    shares = torque_shares(robot, figure.given, marks.torques)
+    effort = None if shares is None else np.zeros((len(times), len(robot.tree.parent)))
+    if shares is not None and len(shares) and t[-1] > 0.0:
+        # Constant over each step; the value of the last step also holds at the end.
+        step = np.minimum((times / t[-1] * len(shares) * (1.0 + 1e-12)).astype(int), len(shares) - 1)
+        effort = shares[step][:, robot.tree.coordinate]
+    return Actor(robot, motions, tuple(own), effort)
 
 
 def _error(figures: Sequence[_Figure]) -> str:
@@ -268,9 +273,7 @@ def _nodes(robot: Robot, name: str, motion: Trajectory) -> tuple[Floats, Floats]
         )
     for what in ("rotation", "translation"):
         saved, present = motion.scene_values.get(what), getattr(robot.tree, what)
-        if saved is not None and not (
-            saved.shape == present.shape and np.allclose(saved, present, rtol=1e-6, atol=1e-9)
-        ):
+        if saved is not None and (saved.shape != present.shape or not np.allclose(saved, present, atol=1e-9)):
             raise InputError(
                 f"the {name} is of robot {motion.robot!r}, whose joints have the names of those of {robot.name!r} but "
                 "other placements"
@@ -314,12 +317,3 @@ def _warn_if_thinned(figures: Sequence[_Figure], times: Floats) -> None:
             "a part of the motion",
             times[-1], len(times), off,
         )  # fmt: skip
-
-
-def _efforts(robot: Robot, shares: Floats | None, end: float, times: Floats) -> Floats | None:
-    """Shares of the limit (K, b) of all joints of the tree at the keyframes, from those of N steps to ``end`` [s]."""
-    if shares is None or not len(shares) or end == 0.0:
-        return None if shares is None else np.zeros((len(times), len(robot.tree.parent)))
-    # Constant over each step; the value of the last step also holds at the end.
-    step = np.minimum((times / end * len(shares) * (1.0 + 1e-12)).astype(int), len(shares) - 1)
-    return shares[step][:, robot.tree.coordinate]

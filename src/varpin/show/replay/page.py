@@ -20,9 +20,8 @@ import umsgpack
 
 from varpin.errors import InputError
 from varpin.io.archive import atomic_file
-from varpin.show.replay.drawing import EFFORT_COLORS, draw
+from varpin.show.replay.drawing import EFFORT_COLORS, Script, draw
 from varpin.show.replay.marks import GHOST_COLOR, legend
-from varpin.show.replay.script import Script
 
 logger = logging.getLogger(__name__)
 
@@ -40,7 +39,7 @@ class Page:
         """Keep a command."""
         # three.js computes in single precision.
         try:
-            self.commands.append(umsgpack.packb(lowered(command), force_float_precision="single"))
+            self.commands.append(umsgpack.packb(command.lower(), force_float_precision="single"))
         except OverflowError:
             raise InputError("the replay has sizes or positions beyond 3e38, which no viewer draws") from None
 
@@ -70,15 +69,6 @@ class Page:
 """
 
 
-def lowered(command: Any) -> dict[str, Any]:
-    """A command in the viewer's format, with the viewer's present name for the type of mesh files."""
-    words: dict[str, Any] = command.lower()
-    for geometry in words.get("object", {}).get("geometries", ()):
-        if geometry["type"] == "_meshfile":
-            geometry["type"] = "_meshfile_geometry"
-    return words
-
-
 def _part(name: str) -> str:
     return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
@@ -89,7 +79,7 @@ def _legend(script: Script) -> Iterator[str]:
     if any(actor.effort is not None for actor in script.actors):
         scale = [int.from_bytes(np.rint(255.0 * color).astype(np.uint8).tobytes()) for color in EFFORT_COLORS]
         lines.append(("torque: none, half, all of the limit", scale))
-    if any("ghost" in actor.positions for actor in script.actors):
+    if any("ghost" in actor.motions for actor in script.actors):
         planned = any(mark.kind == "plan" for mark in script.marks)
         lines.append(("plan" if planned else "ghost", [GHOST_COLOR]))
     lines += [(text, [color]) for text, color in legend(script.marks)]
@@ -156,7 +146,7 @@ def inline_page(script: Script, size: tuple[int, int]) -> Inline:
 
 def _page(script: Script) -> str:
     page = Page()
-    draw(meshcat.Visualizer(window=page), script, legend=True)
+    draw(meshcat.Visualizer(window=page), script)
     return page.html(script)
 
 

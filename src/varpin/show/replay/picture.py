@@ -13,6 +13,7 @@ import pinocchio as pin
 
 from varpin.arrays import Floats
 from varpin.model import Robot, readable_geometry
+from varpin.model.kinematics import links
 from varpin.model.meshes import MeshPart, parts_of, read_mesh
 from varpin.model.tree import joint_axis, z_to
 from varpin.show.replay.marks import corners_of
@@ -75,25 +76,11 @@ class Picture:
             nodes.append(f"{nodes[parent] if parent >= 0 else root}/{name}/moving")
         return nodes
 
-    def body_poses(self, positions: Floats) -> tuple[Floats, Floats]:
-        """World rotation (S, b, 3, 3) and position (S, b, 3) [m] of each body at joint positions (S, b)."""
-        tree = self.robot.tree
-        samples, bodies = positions.shape
-        R, p = np.empty((samples, bodies, 3, 3)), np.empty((samples, bodies, 3))
-        for j, parent in enumerate(tree.parent):
-            before = R[:, parent] if parent >= 0 else np.broadcast_to(np.eye(3), (samples, 3, 3))
-            origin = p[:, parent] if parent >= 0 else np.zeros(3)
-            frame = before @ tree.rotation[j]
-            p[:, j] = origin + before @ tree.translation[j]
-            if tree.prismatic[j]:
-                R[:, j] = frame
-                p[:, j] += positions[:, j, None] * frame[:, :, 2]
-            else:
-                c, s = np.cos(positions[:, j, None]), np.sin(positions[:, j, None])
-                R[:, j] = frame
-                R[:, j, :, 0] = c * frame[:, :, 0] + s * frame[:, :, 1]
-                R[:, j, :, 1] = c * frame[:, :, 1] - s * frame[:, :, 0]
-        return R, p
+    def body_poses(self, q: Floats) -> tuple[Floats, Floats]:
+        """World rotation (S, b, 3, 3) and position (S, b, 3) [m] of each body at configurations (S, n)."""
+        tree, q = self.robot.tree, np.ascontiguousarray(q)
+        poses = [links(tree, j).core.place_frame(np.eye(3), np.zeros(3), q, False)[:2] for j in range(len(tree.parent))]
+        return np.stack([R for R, _ in poses], axis=1), np.stack([p for _, p in poses], axis=1)
 
     def corners(self, body: int) -> Floats:
         """Corners (k, 3) of the boxes around the shapes on a body, in its frame [m]."""
@@ -105,9 +92,9 @@ class Picture:
                 boxes.append(corners_of(box) @ placement.rotation.T + placement.translation)
         return np.concatenate(boxes)
 
-    def swept(self, positions: Floats) -> Floats:
-        """Points (k, 3) [m] of the world around all shapes at joint positions (S, b)."""
-        R, p = self.body_poses(positions)
+    def swept(self, q: Floats) -> Floats:
+        """Points (k, 3) [m] of the world around all shapes at configurations (S, n)."""
+        R, p = self.body_poses(q)
         points = [self.corners(-1), p.reshape(-1, 3)]
         for j in range(R.shape[1]):
             points.append((self.corners(j) @ R[:, j].transpose(0, 2, 1) + p[:, j, None]).reshape(-1, 3))

@@ -19,7 +19,7 @@ _GAP = 0.15
 _GRID_CELL = 0.5
 
 
-def set_view(viewer: meshcat.Visualizer, points: Floats, toward: Floats, size: float) -> None:
+def set_view(viewer: meshcat.Visualizer, points: Floats, toward: Floats, size: float, *, camera: bool = True) -> None:
     """Set camera, grid, axes and background; the grid is at z = 0.
 
     Args:
@@ -27,6 +27,7 @@ def set_view(viewer: meshcat.Visualizer, points: Floats, toward: Floats, size: f
         points: Points that have to be visible (P, 3) [m].
         toward: Unit vector (3,) from the points to the camera.
         size: Size of one robot's motion [m].
+        camera: Whether a new camera is made; else the present one is moved.
     """
     right = across(toward)
     axes = np.array([right, np.cross(toward, right), toward])
@@ -37,16 +38,20 @@ def set_view(viewer: meshcat.Visualizer, points: Floats, toward: Floats, size: f
     distance = _MARGIN * float(np.max(depth + np.maximum(np.abs(width) / (_ASPECT * tangent), np.abs(up) / tangent)))
     distance = distance or size
 
-    camera = meshcat.geometry.PerspectiveCamera(
-        fov=math.degrees(_VERTICAL_VIEW), aspect=_ASPECT, near=0.01 * distance, far=100.0 * distance
-    )
     # meshcat's camera turns about the origin only, so the middle of the motion is moved there.
     shift = -(middle @ axes)
     centered = np.eye(4)
     centered[:3, 3] = shift
     viewer.set_transform(centered)
     offset = distance * toward
-    viewer["/Cameras/default/rotated"].set_object(camera)
+    if camera:
+        lens = {
+            "fov": math.degrees(_VERTICAL_VIEW),
+            "aspect": _ASPECT,
+            "near": 0.01 * distance,
+            "far": 100.0 * distance,
+        }
+        viewer["/Cameras/default/rotated"].set_object(meshcat.geometry.PerspectiveCamera(**lens))
     # That node turns three.js's upward y into the world's z.
     viewer["/Cameras/default/rotated/<object>"].set_property("position", [offset[0], offset[2], -offset[1]])
 
