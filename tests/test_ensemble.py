@@ -328,7 +328,7 @@ def test_a_coarse_step_is_told_of(caplog):
     with caplog.at_level(logging.WARNING, "varpin.ensemble"):
         end = run(scene, **coarse)
         again = run(scene, **coarse)
-    assert naming(about(end.warnings, "error"), "joint2", "varpin.Gauss(3) and a smaller dt")
+    assert naming(about(end.warnings, "error"), "joint2", "varpin.Gauss(3)")
     assert all(warning.startswith("path ") for warning in end.warnings)
     assert again.warnings == end.warnings
     # Once in the log, and in every form of the result.

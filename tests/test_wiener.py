@@ -43,6 +43,13 @@ def test_refined_increments_are_wiener_increments_of_half_the_step():
     assert abs((middle**2).mean() - 0.25 * dt) < 4.0 * 0.25 * dt * np.sqrt(2.0 / N)
 
 
+@pytest.mark.parametrize("factor", [1, 2, 3])
+def test_coarse_increments_are_sums(factor):
+    dw = np.arange(12.0).reshape(6, 2) ** 2
+    sums = [[sum(dw[k * factor + i, c] for i in range(factor)) for c in range(2)] for k in range(6 // factor)]
+    np.testing.assert_array_equal(coarsen(dw, factor), sums)
+
+
 @pytest.mark.parametrize(
     ("call", "facts"),
     [
