@@ -133,16 +133,6 @@ def main() -> None:
                 "solve: all 16 joints": lambda: vp.solve(everything.problem),
             },
         )
-        path = hand(Path(folder), ["joint_1.0", "joint_5.0", "joint_9.0", "joint_13.0"])
-        path.write_text(path.read_text().replace("steps = 40", "steps = 400"))
-        four = vp.load_scene(path)
-        compare(
-            "an Allegro hand that moves four fingers, 400 steps",
-            {
-                "solve: each finger apart": lambda: four.solve(apart=True),
-                "solve: all together": lambda: vp.solve(four.problem),
-            },
-        )
     side_by_side()
 
 

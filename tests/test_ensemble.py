@@ -183,29 +183,6 @@ def test_linear_feedback(kick):
             np.testing.assert_allclose(end.p[path, k + 1], p, rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("other", ["dt", "steps"])
-def test_a_duration_stands_for_the_step_or_their_number(other):
-    there = run()
-    np.testing.assert_array_equal(run(**{"duration": there.t[-1], other: None}).q, there.q)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "facts"),
-    [
-        (([[1.0]], [1.0], [[0.0]]), ("gains", "(1,)")),
-        (([[1.0]], [[[1.0], [1.0, 2.0]]], [[0.0]]), "gains"),
-        ((np.ones((3, 2)), np.ones((4, 2, 4)), np.ones((4, 4))), ("u", "(4, 2)", "(3, 2)")),
-        ((np.ones((4, 2)), np.ones((4, 2, 4)), np.ones((6, 4))), ("reference", "(4, 4)", "(6, 4)")),
-        ((np.ones((4, 2)), np.ones((4, 2, 4)), 0.0), ("reference", "(4, 4)", "()")),
-        ((np.ones((4, 2)), np.ones((4, 2, 4)), None), "reference"),
-        ((np.ones((4, 2)), np.full((4, 2, 4), np.nan), np.ones((4, 4))), ("gains[0, 0, 0]", "nan")),
-    ],
-)
-def test_policies_that_do_not_fit_together(arguments, facts):
-    with refused(vp.InputError, facts):
-        vp.LinearPolicy(*arguments)
-
-
 @pytest.mark.parametrize(
     ("shape", "facts"),
     [
@@ -274,11 +251,8 @@ def test_failing_paths_are_left_out_from_where_they_fail(monkeypatch, caplog):
     same_statistics(run(fragile_scene(), store=False, **options), end, 1e-13)
 
 
-@pytest.mark.parametrize("block", [2, 60])
-def test_all_paths_failing_is_an_error(monkeypatch, block):
-    failing = slice(0, 18, 3)
-    options = FRAGILE | {"paths": 6, "q0": starts(40)[failing], "v0": np.zeros(3)}
-    blocks_of(monkeypatch, block * numbers_a_step(fragile_scene(), 6))
+def test_all_paths_failing_is_an_error():
+    options = FRAGILE | {"paths": 6, "q0": starts(40)[:18:3], "v0": np.zeros(3)}
     with refused(vp.VarpinError, "6 of 6") as caught:
         run(fragile_scene(), **options)
     assert type(caught.value) is vp.VarpinError
@@ -390,31 +364,18 @@ CUSTOM = vp.CustomNoise(lambda q, v, u: np.eye(2), 2)
         ({"scene": "chain"}, ("scene", "varpin.Scene", "str")),
         ({"scene": vp.Scene(vp.planar_chain(2), noise=CUSTOM)}, "noise"),
         ({"dt": 0.0}, ("dt", "0.0")),
-        ({"steps": -1}, ("steps", "0", "-1")),
-        ({"steps": 2.5}, ("steps", "2.5")),
         ({"steps": 10**14}, ("100000000000000", "40")),
         ({"paths": 0}, ("paths", "1", "0")),
-        ({"paths": "many"}, ("paths", "'many'")),
         ({"rng": -3}, ("rng", "0", "-3")),
-        ({"rng": "seed"}, "rng"),
-        ({"q0": [0.0, 0.0, 0.0]}, ("q0", "(40, 2)", "(3,)")),
         ({"q0": np.zeros((39, 2))}, ("q0", "(40, 2)", "(39, 2)")),
         ({"v0": [0.0, np.nan]}, ("v0[1]", "nan")),
-        (
-            {"controls": np.zeros((49, 2))},
-            ("controls", "(50, 2)", "(2,)", "(49, 2)"),
-        ),
-        ({"controls": [np.inf, 0.0]}, ("controls[0]", "inf")),
+        ({"controls": np.zeros((49, 2))}, ("controls", "(50, 2)", "(2,)", "(49, 2)")),
         ({"controls": lambda t, q, v: q}, ("simulate", "law")),
         ({"integrator": "midpoint"}, "integrator"),
         ({"quantiles": [0.5, 1.5]}, ("quantiles", "[0, 1]", "[0.5, 1.5]")),
         ({"quantiles": 0.5}, ("quantiles", "[0, 1]", "0.5")),
-        ({"quantiles": [np.nan]}, ("quantiles[0]", "nan")),
         ({"duration": 1.0}, ("dt", "steps", "duration", "all three")),
-        ({"steps": None}, ("dt", "steps", "duration")),
-        ({"steps": None, "duration": 0.1234567}, ("duration", "dt")),
         ({"workers": 0}, ("workers", "1", "0")),
-        ({"workers": 1.5}, ("workers", "1.5")),
     ],
 )
 def test_bad_input(options, facts):

@@ -96,7 +96,7 @@ def test_the_first_is_answered_at_once_even_within_the_core(tmp_path):
     assert command.end() == 130
     kept = vp.Trajectory.load(path)
     assert 0 < kept.steps < 60000
-    assert f"varpin: interrupted after {kept.steps} of 60000 steps, which are kept" in command.lines
+    assert f"varpin: interrupted after {kept.steps} steps, which are kept" in command.lines
 
 
 def test_the_first_while_writing_finishes_the_file(tmp_path):
@@ -137,17 +137,15 @@ sys.exit(main(sys.argv[1:]))
 
 
 @pytest.mark.slow
-def test_two_within_one_call_end_it_too(tmp_path):
+def test_two_within_one_call_end_it_at_once(tmp_path):
     path = tmp_path / "a.npz"
     command = Command(*LONG, "--save", str(path), run=3.0, save=60.0)
     command.wait_for("RUNNING")
-    for words in ("what is done is kept", "again: ending"):
-        time.sleep(0.1)
-        command.interrupt()
-        command.wait_for(words)
-    asked = time.monotonic()
+    command.interrupt()
+    command.wait_for("what is done is kept")
+    asked = command.interrupt()
     assert command.end() == 130
-    assert time.monotonic() - asked < 20.0
+    assert time.monotonic() - asked < 2.0
     assert not path.exists()
 
 

@@ -178,90 +178,33 @@ if TYPE_CHECKING:
     from varpin.study.precision import work_precision as work_precision
     from varpin.study.record import StudyInterrupted as StudyInterrupted
 
-# What a simulation has no need of is imported with its first use: all of it at once takes as long as Pinocchio.
-_LATE: dict[str, tuple[str, ...]] = {
-    "varpin.control.constraints": (
-        "KeepClear",
-        "KeepInBox",
-        "KeepInHalfSpace",
-        "KeepInSphere",
-        "KeepOutOfSphere",
-        "PlanConstraint",
-        "ReachFrame",
-        "WithinControlRate",
-        "WithinJointLimits",
-        "WithinVelocityLimits",
-    ),
-    "varpin.control.costs": (
-        "BoundCost",
-        "CenterOfMassCost",
-        "ControlCost",
-        "ControlRateCost",
-        "Cost",
-        "CostError",
-        "CustomCost",
-        "Expansion",
-        "FrameOrientationCost",
-        "FramePositionCost",
-        "FrameVelocityCost",
-        "JointLimitBarrier",
-        "ManipulabilityCost",
-        "Points",
-        "Terminal",
-        "TrackingCost",
-        "VelocityCost",
-        "VelocityLimitBarrier",
-    ),
-    "varpin.model.clearance": ("Obstacle",),
-    "varpin.ensemble": ("Ensemble", "EnsembleInterrupted", "EnsembleStatistics", "PathFailure", "simulate_ensemble"),
-    "varpin.show.inspection": ("FrameReport", "JointReport", "LinkReport", "RobotReport", "inspect_robot"),
-    "varpin.show.replay.live": ("LiveView",),
-    "varpin.show.replay.motion": ("replay",),
-    "varpin.linearization": ("Curvature", "Linearization", "Moments", "linearize", "propagate_moments", "second_order"),
-    "varpin.study.extremes": ("check_robot",),
-    "varpin.study.linearization_check": ("LinearizationCheck", "check_linearization"),
-    "varpin.control.mpc": ("Mpc", "MpcRun", "Plant"),
-    "varpin.io.scenefile": ("SceneFile", "SceneFileError", "load_scene"),
-    "varpin.control": (
-        "ConstraintReport",
-        "Iteration",
-        "MonteCarlo",
-        "MonteCarloInterrupted",
-        "Multipliers",
-        "OptimalControlProblem",
-        "Refined",
-        "Refinement",
-        "SearchState",
-        "Solution",
-        "Status",
-        "Verification",
-        "ViolationOnRobot",
-        "solve",
-    ),
-    "varpin.study.advice": ("Advice", "Choice", "advise"),
-    "varpin.study.plans": ("OptimalControlRun", "OptimalControlTradeoff", "optimal_control_tradeoff"),
-    "varpin.study.precision": ("WorkPrecision", "WorkPrecisionRun", "work_precision"),
-    "varpin.study.record": ("StudyInterrupted",),
-}
-
 # Submodules that a user takes from the top level.
 _MODULES = {"plots": "varpin.show.plots", "wiener": "varpin.mechanics.wiener"}
 
 
 if not TYPE_CHECKING:
+    # What a simulation has no need of is imported with its first use: all of it at once takes as long as Pinocchio.
+    import ast as _ast
+    import functools as _functools
+
+    @_functools.cache
+    def _late() -> dict[str, str]:
+        """The module of each name that the block for type checkers above imports."""
+        source = _ast.parse(__spec__.loader.get_source(__name__))
+        (block,) = (item for item in source.body if isinstance(item, _ast.If) and isinstance(item.test, _ast.Name))
+        return {name.asname: item.module for item in block.body for name in item.names}
 
     def __getattr__(name: str) -> object:
         from importlib import import_module  # noqa: PLC0415 - no public name
 
         if name in _MODULES:
-            globals()[name] = value = import_module(_MODULES[name])
-            return value
-        for module, names in _LATE.items():
-            if name in names:
-                globals()[name] = value = getattr(import_module(module), name)
-                return value
-        raise AttributeError(f"module 'varpin' has no attribute {name!r}")
+            found = import_module(_MODULES[name])
+        elif name in _late():
+            found = getattr(import_module(_late()[name]), name)
+        else:
+            raise AttributeError(f"module 'varpin' has no attribute {name!r}")
+        globals()[name] = found
+        return found
 
     def __dir__() -> list[str]:
-        late = (name for names in _LATE.values() for name in names)
-        return sorted({*globals(), *late, *_MODULES} - {"TYPE_CHECKING"})
+        return sorted({*globals(), *_late(), *_MODULES} - {"TYPE_CHECKING"})

@@ -183,7 +183,7 @@ class UnknownPosture(InputError):
         known = f"{hint}postures: {', '.join(self.postures)}"
         none = (
             "it has none: give the SRDF file that has them, load_robot(..., srdf=path), or srdf under [robot] in a "
-            "scene file, or --srdf of a command"
+            "scene file"
         )
         super().__init__(f"robot {robot!r} has no posture {posture!r}; {known if self.postures else none}")
 

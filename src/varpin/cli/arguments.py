@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +31,11 @@ def add_robot(parser: argparse.ArgumentParser, *, scenes: bool = False) -> None:
 
 
 # Options that :func:`add_robot_options` adds.
-ROBOT_OPTIONS = ("lock", "package_dir", "base", "armature")
+ROBOT_OPTIONS = ("lock", "package_dir")
 
 
 def add_robot_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options with which the robot is loaded: locked joints, meshes, base, armature."""
+    """Add the options with which the robot is loaded; a scene file has more."""
     parser.add_argument(
         "--lock",
         type=_lock,
@@ -51,39 +51,25 @@ def add_robot_options(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder in which package:// paths of meshes are looked up; repeatable",
     )
-    parser.add_argument(
-        "--base", choices=("planar",), help="put the robot on a base that slides along x and y and turns"
-    )
-    add_vector(parser, "armature", "rotor inertia reflected to the joints [kg m^2 or kg]; default: the file's")
 
 
 def robot_options(request: argparse.Namespace) -> dict[str, Any]:
     """The options of :func:`add_robot_options` as arguments of :func:`varpin.load_robot`."""
-    return {
-        "package_dirs": request.package_dir,
-        "lock": dict(request.lock),
-        "base": request.base,
-        "armature": values_of("armature", request.armature),
-    }
+    return {"package_dirs": request.package_dir, "lock": dict(request.lock)}
 
 
 def add_motion(parser: argparse.ArgumentParser) -> None:
-    """Add the initial state of a motion, and the forces on it."""
+    """Add the initial state of a motion, and the commonest forces on it; a scene file has all."""
     start = parser.add_argument_group("start")
     text = "initial configuration [rad or m], or the name of a posture of the robot's SRDF file (home); default: 0"
     add_vector(start, "q0", text)
-    start.add_argument("--srdf", metavar="FILE", help="SRDF file of the postures; default: that of the robot's file")
     add_vector(start, "v0", "initial velocity [rad/s or m/s]; default: 0")
     surroundings = parser.add_argument_group("surroundings")
     add_gravity(surroundings)
     text = "viscous damping [N m s/rad or N s/m], or 'robot' for that of the robot's description; default: 0"
     add_vector(surroundings, "damping", text)
-    text = "dry friction [N m or N], or 'robot' for that of the robot's description; default: 0"
-    add_vector(surroundings, "friction", text)
     add_vector(surroundings, "stiffness", "joint springs [N m/rad or N/m]; default: 0")
     add_vector(surroundings, "rest", "rest positions of the springs [rad or m]; default: 0")
-    text = "'robot' for the equality constraints of the robot's MJCF file; default: none"
-    surroundings.add_argument("--constraints", choices=["robot"], help=text)
     add_vector(surroundings, "torque", "constant generalized forces [N m or N]; default: 0")
 
 
@@ -162,18 +148,15 @@ def values_of(option: str, given: Sequence[float | tuple[str, float] | str] | No
     """
     if given is None:
         return None
-    if len({float if isinstance(item, int) else type(item) for item in given}) > 1:
-        told = "".join(f", such as {item!r}" for item in given if isinstance(item, str))
-        raise InputError(f"--{option} takes numbers, or JOINT=VALUE, or one word alone{told}; not several of these")
-    pairs = [item for item in given if isinstance(item, tuple)]
-    names = [name for name, _ in pairs]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise InputError(f"--{option} names {', '.join(map(repr, twice))} more than once")
-    if pairs:
-        return dict(pairs)
+    if len({type(item) for item in given}) > 1:
+        raise InputError(f"--{option} takes numbers, or JOINT=VALUE, or one word alone; not several of these")
     numbers: list[Any] = list(given)
-    found: JointValues | str = numbers[0] if len(numbers) == 1 else numbers
-    return found
+    if not isinstance(given[0], tuple):
+        return numbers[0] if len(numbers) == 1 else numbers
+    named = dict(numbers)
+    if len(named) < len(numbers):
+        raise InputError(f"--{option} names a joint more than once, among {', '.join(map(repr, named))}")
+    return named
 
 
 def _joints(option: str, request: argparse.Namespace, robot: Robot) -> Floats | str | None:
@@ -181,22 +164,17 @@ def _joints(option: str, request: argparse.Namespace, robot: Robot) -> Floats | 
     values = values_of(option, getattr(request, option))
     if values is None or isinstance(values, str):
         return values
-    if not isinstance(values, Mapping) and np.size(values) not in (1, robot.dof):
-        raise InputError(
-            f"--{option} takes one number for all joints or {robot.dof}, for {', '.join(robot.joint_names)}; "
-            f"got {np.size(values)}"
-        )
-    return joint_array(option, values, robot.joint_names, uniform=True)
+    return joint_array(f"--{option}", values, robot.joint_names, uniform=True)
 
 
 def motion_of(request: argparse.Namespace) -> tuple[Scene, ArrayLike, ArrayLike, NDArray[np.float64] | None]:
     """The scene, q0, v0, and the torque unless it is zero."""
-    robot = load_robot(request.robot, **robot_options(request), srdf=request.srdf)
-    names = ("damping", "friction", "stiffness", "rest", "q0", "v0", "torque")
+    robot = load_robot(request.robot, **robot_options(request))
+    names = ("damping", "stiffness", "rest", "q0", "v0", "torque")
     given: dict[str, Any] = {name: _joints(name, request, robot) for name in names}
     q0, v0, torque = (given.pop(name) for name in ("q0", "v0", "torque"))
     forces = {name: value for name, value in given.items() if value is not None}
-    scene = Scene(robot, gravity=request.gravity, constraints=request.constraints, **forces)
+    scene = Scene(robot, gravity=request.gravity, **forces)
     still = np.zeros(robot.dof)
     start = robot.posture(q0) if isinstance(q0, str) else still if q0 is None else q0
     return scene, start, still if v0 is None else v0, torque if np.any(torque) else None
@@ -207,24 +185,18 @@ def names_scene(word: str) -> bool:
     return Path(word).suffix == ".toml" or word in scenes()
 
 
-def scene_file(request: argparse.Namespace, word: str, *given: str) -> SceneFile:
-    """Load a scene file. Its outputs replace those that the command line does not set.
-
-    Args:
-        request: The parsed command line.
-        word: Path or name of the scene.
-        *given: The command, then its options that exclude a scene file.
-
-    Raises:
-        InputError: An option that excludes a scene file is given.
-    """
-    command, default = given[0], request.parser.parse_args(["robot"]) if len(given) > 1 else None
-    for name in given[1:]:
+def scene_file(request: argparse.Namespace, word: str, *excluded: str) -> SceneFile:
+    """Load a scene file, with which the options ``excluded`` cannot be given."""
+    default = request.parser.parse_args(["robot"])
+    for name in excluded:
         if getattr(request, name) != getattr(default, name):
             option = name.replace("_", "-") if getattr(request, name) is not False else f"no-{name}"
-            raise InputError(f"--{option} cannot be given with a scene file: {command} {word} takes it from the file")
-    scene = load_scene(word)
-    for name, value in scene.outputs.items():
+            raise InputError(f"--{option} cannot be given with a scene file: {word} has it")
+    return load_scene(word)
+
+
+def take_outputs(request: argparse.Namespace, file: SceneFile) -> None:
+    """Outputs of a scene file replace those that the command line does not set."""
+    for name, value in file.outputs.items():
         if getattr(request, name, value) is None:
             setattr(request, name, value)
-    return scene

@@ -38,7 +38,7 @@ def add_inspect(parser: argparse.ArgumentParser) -> None:
 
 
 def _inspect_scene(request: argparse.Namespace) -> int:
-    file = scene_file(request, request.robot, "inspect", *ROBOT_OPTIONS, "gravity", "q", "v")
+    file = scene_file(request, request.robot, *ROBOT_OPTIONS, "gravity", "q", "v")
     rows = [("robot", file.robot.name), *file.required.rows]
     rows.append(("horizon", f"{file.steps} steps of {file.dt:g} s, {file.integrator}"))
     show(Table(f"{file.title} ({file.path.name})", (), rows))

@@ -1,4 +1,4 @@
-"""Ctrl-C: the first stops the run and keeps its results, the second ends all."""
+"""Ctrl-C: the first stops the run and keeps its results, the second ends the process."""
 
 from __future__ import annotations
 
@@ -7,22 +7,19 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
-from types import FrameType, TracebackType
+from types import FrameType
 
 from rich.console import Console
 
 from varpin.cli.console import say
-
-_STOPPING = "Ctrl-C: stopping"
-_KEEPING = "Ctrl-C: stopping; what is done is kept, and a second one ends without it"
-_ENDING = "Ctrl-C again: ending"
+from varpin.cli.exits import INTERRUPTED
 
 
-class Interrupts:
+class Interrupts(contextlib.ExitStack):
     """Handler of SIGINT within a ``with`` block in the main thread.
 
     Python calls a signal handler between two of its instructions, and a call of the core may last for seconds. A thread
-    therefore prints an answer at once; the handler acts later. Every Ctrl-C raises KeyboardInterrupt, but for a first
+    therefore answers at once, and ends the process at the second Ctrl-C. The first raises KeyboardInterrupt, but for
     one while a file is being :meth:`written`, which sets ``wanted``.
 
     Attributes:
@@ -30,11 +27,10 @@ class Interrupts:
     """
 
     def __init__(self, console: Console) -> None:
+        super().__init__()
         self.wanted = False
         self._console = console
         self._keeping = self._writing = False
-        self._received = self._handled = 0
-        self._undo = contextlib.ExitStack()
 
     def __enter__(self) -> Interrupts:
         main = threading.current_thread() is threading.main_thread()
@@ -43,17 +39,12 @@ class Interrupts:
             os.set_blocking(writer, False)
             thread = threading.Thread(target=self._answer, args=(reader,), daemon=True)
             thread.start()
-            self._undo.callback(os.close, reader)
-            self._undo.callback(thread.join)
-            self._undo.callback(os.close, writer)
-            self._undo.callback(signal.set_wakeup_fd, signal.set_wakeup_fd(writer, warn_on_full_buffer=False))
-            self._undo.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, self._handle))
+            self.callback(os.close, reader)
+            self.callback(thread.join)
+            self.callback(os.close, writer)
+            self.callback(signal.set_wakeup_fd, signal.set_wakeup_fd(writer, warn_on_full_buffer=False))
+            self.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, self._handle))
         return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._undo.close()
 
     @contextlib.contextmanager
     def keeping(self) -> Iterator[None]:
@@ -67,9 +58,6 @@ class Interrupts:
     @contextlib.contextmanager
     def written(self) -> Iterator[None]:
         """A block within :meth:`keeping` that writes one file."""
-        # Python handles several signals within one call of the core as one.
-        if self._received > max(1, self._handled):
-            raise KeyboardInterrupt
         self._writing = True
         try:
             yield
@@ -77,16 +65,21 @@ class Interrupts:
             self._writing = False
 
     def _answer(self, reader: int) -> None:
-        """Print an answer to each SIGINT at once, even while the main thread is in the core."""
+        """Answer each SIGINT at once, even while the main thread is in the core."""
+        received = 0
         while number := os.read(reader, 1):
-            if number[0] == signal.SIGINT:
-                self._received += 1
-                first = _KEEPING if self._keeping else _STOPPING
-                say(self._console, first if self._received == 1 else _ENDING)
+            if number[0] != signal.SIGINT:
+                continue
+            received += 1
+            if received == 1:
+                kept = "; what is done is kept, and a second one ends without it" if self._keeping else ""
+                say(self._console, f"Ctrl-C: stopping{kept}")
+            else:
+                # A progress bar hides the cursor.
+                self._console.show_cursor()
+                os._exit(INTERRUPTED)
 
     def _handle(self, _number: int, _frame: FrameType | None) -> None:
-        self._handled += 1
-        if self._writing and self._handled == 1:
-            self.wanted = True
-        else:
+        if not self._writing:
             raise KeyboardInterrupt
+        self.wanted = True

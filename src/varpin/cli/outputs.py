@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
 from varpin.cli.console import complain
 from varpin.cli.exits import INTERRUPTED, MISTAKE
 from varpin.cli.interrupts import Interrupts
-from varpin.errors import FileError, InputError, VarpinError
+from varpin.errors import InputError, VarpinError
 from varpin.io.archive import atomic_file
 from varpin.marks import Marks
 from varpin.model import Robot
@@ -59,15 +61,16 @@ def writers_of(request: argparse.Namespace, marks: MarksOf | None = None) -> Wri
 
     Raises:
         FileError: A file cannot be written.
-        InputError: Two files are the same, or a format is unknown.
+        InputError: Two files are the same, or a format or the speed is unknown.
         MissingDependency: A package or program for videos is not installed.
     """
     found: Writers = {}
-    for option, endings, make in (
-        ("save", (".npz",), _record),
-        ("plot", (".png", ".pdf", ".svg"), _figure),
-        ("html", (".html", ".htm"), _replay),
-        ("video", FORMATS, _replay),
+    show = partial(_show, speed_of(request), request.trace, marks)
+    for option, endings, write in (
+        ("save", (".npz",), _save),
+        ("plot", (".png", ".pdf", ".svg"), _plot),
+        ("html", (".html", ".htm"), partial(show, "html")),
+        ("video", FORMATS, partial(show, "video")),
     ):
         path: Path | None = getattr(request, option, None)
         if path is None:
@@ -77,40 +80,38 @@ def writers_of(request: argparse.Namespace, marks: MarksOf | None = None) -> Wri
             raise InputError(f"--{option} must end in {', '.join(endings)}, got {path.name!r}")
         if option == "video":
             check_film(path)
-        if target.resolve() in (other.resolve() for other in found):
+        if target in found:
             raise InputError(f"two outputs cannot be one file: {path}")
-        found[target] = make(target, request, option, marks)
+        found[target] = partial(write, target)
     return found
 
 
-def _record(path: Path, *_: object) -> Callable[[Robot, Trajectory], object]:
-    return lambda _robot, trajectory: trajectory.save(path)
+def _save(path: Path, _robot: Robot, trajectory: Trajectory) -> None:
+    trajectory.save(path)
 
 
-def _figure(path: Path, *_: object) -> Callable[[Robot, Trajectory], object]:
+def _plot(path: Path, robot: Robot, trajectory: Trajectory) -> None:
     from varpin.show.plots import plot_trajectory  # noqa: PLC0415 - matplotlib is slow to import
 
-    def write(robot: Robot, trajectory: Trajectory) -> None:
-        figure, _ = plot_trajectory(trajectory, robot=robot)
-        with atomic_file(path) as stream:
-            figure.savefig(stream, format=path.suffix[1:].lower(), dpi=150)  # type: ignore[union-attr]
-
-    return write
+    figure, _ = plot_trajectory(trajectory, robot=robot)
+    with atomic_file(path) as stream:
+        figure.savefig(stream, format=path.suffix[1:].lower(), dpi=150)  # type: ignore[union-attr]
 
 
-def _replay(
-    path: Path, request: argparse.Namespace, option: str, marks: MarksOf | None
-) -> Callable[[Robot, Trajectory], object]:
-    speed = speed_of(request)
+def _show(
+    speed: float,
+    trace: Sequence[str],
+    marks: MarksOf | None,
+    option: str,
+    path: Path,
+    robot: Robot,
+    trajectory: Trajectory,
+) -> None:
+    from varpin.show.replay.motion import replay  # noqa: PLC0415 - meshcat is slow to import
 
-    def write(robot: Robot, trajectory: Trajectory) -> None:
-        from varpin.show.replay.motion import replay  # noqa: PLC0415 - meshcat is slow to import
-
-        task = Marks() if marks is None else marks(trajectory.duration)
-        shown, files = replace(task, trace=request.trace or task.trace), {option: path}
-        replay(robot, trajectory, html=files.get("html"), video=files.get("video"), speed=speed, marks=shown)
-
-    return write
+    task = Marks() if marks is None else marks(trajectory.duration)
+    files: dict[str, Any] = {option: path}
+    replay(robot, trajectory, **files, speed=speed, marks=replace(task, trace=trace or task.trace))
 
 
 def speed_of(request: argparse.Namespace) -> float:
@@ -140,13 +141,3 @@ def write_all(
         else:
             written.append(path)
     return written, INTERRUPTED if interrupts.wanted else status
-
-
-def folder_at(path: Path) -> Path:
-    """``path`` as a folder, created if necessary."""
-    folder = path.expanduser()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"cannot make the folder {folder}: {error.strerror or error}") from None
-    return folder

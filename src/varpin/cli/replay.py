@@ -11,13 +11,13 @@ from pathlib import Path
 
 from rich.console import Console
 
-from varpin.cli.arguments import add_robot_options, names_scene, robot_options
+from varpin.cli.arguments import ROBOT_OPTIONS, add_robot_options, names_scene, robot_options, scene_file
 from varpin.cli.console import say, show
 from varpin.cli.outputs import add_replay_options, speed_of, write_all, writers_of
 from varpin.control import solution_trajectory
 from varpin.errors import FileError, InputError, RobotNotFound
 from varpin.io.archive import read_format
-from varpin.io.scenefile import SceneFile, load_scene
+from varpin.io.scenefile import SceneFile
 from varpin.marks import Marks
 from varpin.model import Robot, load_robot
 from varpin.show.given import frame_names
@@ -95,11 +95,7 @@ def _motion(path: Path, robot: Robot | None = None) -> Trajectory:
 def _robot(request: argparse.Namespace, motion: Trajectory) -> tuple[Robot, SceneFile | None]:
     """The robot of the motion, and its scene if ``--robot`` names one."""
     if request.robot is not None and names_scene(request.robot):
-        if request.lock or request.package_dir or request.base or request.armature:
-            raise InputError(
-                "--lock, --package-dir, --base and --armature cannot be given with a scene file, which has its own"
-            )
-        scene = load_scene(request.robot)
+        scene = scene_file(request, request.robot, *ROBOT_OPTIONS)
         return scene.robot, scene
     name = request.robot or motion.robot
     try:

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from varpin.cli.arguments import scene_file
+from varpin.cli.arguments import take_outputs
 from varpin.cli.console import progress_bar, say, show, written_rows
 from varpin.cli.exits import INTERRUPTED, STEP_FAILED
 from varpin.cli.outputs import add_outputs, write_all, writers_of
 from varpin.control import Solution, Status
-from varpin.io.scenefile import SceneFile
+from varpin.io.scenefile import SceneFile, load_scene
 from varpin.support.checks import writable
 from varpin.support.tables import Table
 
@@ -46,7 +46,8 @@ def add_solve(parser: argparse.ArgumentParser) -> None:
 
 
 def _solve(request: argparse.Namespace, errors: Console) -> int:
-    file = scene_file(request, request.scene, "solve")
+    file = load_scene(request.scene)
+    take_outputs(request, file)
     outputs = writers_of(request, file.marks)
     given = {"max_iterations": request.max_iterations, "true_cost": request.true_cost}
     options = {name: value for name, value in given.items() if value is not None}
@@ -95,10 +96,9 @@ def _status(solution: Solution, scene: str, kept: Path | None) -> str:
 
 def _plan_table(file: SceneFile, solution: Solution, told: str, wall_time: float, files: Iterable[Path]) -> Table:
     problem, refinement = solution.problem, solution.refinement
-    apart = f", planned in {len(file.required.parts)} parts" if len(file.required.parts) > 1 else ""
     noise = f", and {solution.noise_cost:.6g} by noise" if solution.noise_cost else ""
     rows = [
-        ("joints", f"{file.robot.dof} of {file.required.described} computed{apart}"),
+        ("joints", f"{file.robot.dof} of {file.required.described} computed"),
         ("horizon", f"{problem.steps} steps of {problem.dt:g} s, {problem.integrator}"),
         ("status", told),
         ("cost", f"{solution.cost:.6g}{noise}, after {solution.iterations} iterations"),

@@ -14,12 +14,12 @@ from rich.console import Console
 from varpin.cli.arguments import add_motion, add_robot, motion_of, robot_options
 from varpin.cli.console import progress_bar, say, show
 from varpin.cli.exits import FAULTY, INTERRUPTED, STEP_FAILED
-from varpin.cli.outputs import folder_at
+from varpin.errors import FileError
 from varpin.model import load_robot
 from varpin.study.advice import advise
 from varpin.study.precision import work_precision
 from varpin.study.record import Progress, Study, StudyInterrupted
-from varpin.support.checks import positive
+from varpin.support.checks import path_like
 from varpin.support.tables import Table
 
 if TYPE_CHECKING:
@@ -75,12 +75,9 @@ def add_advise(parser: argparse.ArgumentParser) -> None:
 
 
 def _advise(request: argparse.Namespace, errors: Console) -> int:
-    for option, unit in (("tolerance", "rad or m"), ("budget", "s")):
-        if getattr(request, option) is not None:
-            positive(f"--{option}", getattr(request, option), unit)
     folder = _folder(request)
-    say(errors, "trying integrators on this motion, for a minute at most")
     scene, q0, v0, torque = motion_of(request)
+    say(errors, "trying integrators on this motion, for a minute at most")
     options = {"controls": torque, "tolerance": request.tolerance, "budget": request.budget}
     advice = advise(scene, q0, v0, duration=request.duration, **options)
     show("\n".join(advice.notes))
@@ -142,7 +139,15 @@ def _add_outputs(parser: argparse.ArgumentParser, quiet: str | None = "print war
 
 
 def _folder(request: argparse.Namespace) -> Path | None:
-    return None if request.out is None else folder_at(request.out)
+    """The folder of the files, made if necessary; None for no files."""
+    if request.out is None:
+        return None
+    folder = path_like("--out", request.out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"cannot make the folder {folder}: {error.strerror or error}") from None
+    return folder
 
 
 def _kept(request: argparse.Namespace, errors: Console, study: Callable[[Progress], Made]) -> Made:
@@ -156,19 +161,13 @@ def _kept(request: argparse.Namespace, errors: Console, study: Callable[[Progres
 
 
 def _show_kinds(record: Record) -> None:
-    """A letter for each motion and integrator, and how many of each letter an integrator has."""
-    columns = list(dict.fromkeys(cell.integrator for cell in record.runs))
-    letters = {(cell.trial, cell.integrator): cell.kind.letter for cell in record.runs}
-    names = dict.fromkeys(cell.trial for cell in record.runs)
-    rows = [(name, *(letters.get((name, column), "") for column in columns)) for name in names]
-    show(Table(f"{record.robot} at the extremes", ("motion", *(str(k + 1) for k in range(len(columns)))), rows))
-    kinds = list(record.counts())
-    found = [[cell.kind for cell in record.runs if cell.integrator == name] for name in columns]
-    counted = zip(columns, found, strict=True)
-    totals = [(k + 1, name, *map(own.count, kinds)) for k, (name, own) in enumerate(counted)]
-    show(Table("", ("#", "integrator", *(kind.value for kind in kinds)), totals))
-    for kind, count in record.counts().items():
-        show(f"{kind.letter}: {count} {kind.value}: {kind.meaning}")
+    """How many motions of each kind an integrator has."""
+    kinds, integrators = record.counts(), dict.fromkeys(cell.integrator for cell in record.runs)
+    found = {name: [cell.kind for cell in record.runs if cell.integrator == name] for name in integrators}
+    rows = [(name, *map(own.count, kinds)) for name, own in found.items()]
+    show(Table(f"{record.robot} at the extremes", ("integrator", *(kind.value for kind in kinds)), rows))
+    for kind, count in kinds.items():
+        show(f"{count} {kind.value}: {kind.meaning}")
 
 
 def _write(folder: Path | None, name: str, study: Study[Any], title: str, *, quiet: bool = False) -> None:

@@ -17,7 +17,7 @@ from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import CostSum
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.verification import excess, percent
-from varpin.ensemble.looks import greater, looked_at, looked_at_here
+from varpin.ensemble.looks import findings_of_paths, greater
 from varpin.ensemble.paths import Extremes, Shared, Task, chunks, simulate_paths, without_geometry
 from varpin.errors import VarpinError
 from varpin.finding import Finding, announce
@@ -277,15 +277,15 @@ def monte_carlo(
             with contextlib.closing(results):
                 take_all(results, add, lambda: progress(done, paths) if progress is not None else None)
             if every.shared is not None:
-                found = looked_at(pool, every.shared, q0, v0, extremes)
+                found = findings_of_paths(every.shared, q0, v0, extremes, pool)
             elif np.isfinite(parts[0].costs).all():
                 found = _look_alone(every)
         except KeyboardInterrupt:
-            if every.shared is not None and done > 1:
-                found = looked_at_here(every.shared, q0[:done], v0[:done], extremes)
-            elif done > 1 and np.isfinite(parts[0].costs).all():
-                # A second Ctrl-C skips the check.
-                with contextlib.suppress(KeyboardInterrupt):
+            # A second Ctrl-C skips the check.
+            with contextlib.suppress(KeyboardInterrupt):
+                if every.shared is not None and done > 1:
+                    found = findings_of_paths(every.shared, q0[:done], v0[:done], extremes, None)
+                elif done > 1 and np.isfinite(parts[0].costs).all():
                     found = _look_alone(every)
             raise MonteCarloInterrupted(warned(found)) from None
     result = warned(found)

@@ -86,7 +86,7 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
     # First the motion, whose masses give a clearer message for another robot.
     motion = replace(Trajectory.of_members(source, members, scene.robot), scene_values=scene.values)
     known = [name for name in members if name.startswith(("problem.", "scene."))]
-    setting = {name.removeprefix("problem."): members[name] for name in known}
+    setting = {name.removeprefix("problem."): np.asarray(members[name]) for name in known}
     if difference := problem.differs(setting):
         raise FileError(f"{source} is of another problem: {difference}")
     sizes = {"decisions": problem.decisions, "controls": scene.controls, "states": 2 * scene.robot.dof}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
 
@@ -23,41 +22,26 @@ def greater(one: Extremes, other: Extremes) -> Extremes:
     return {name: max(one.get(name, found), found, key=lambda x: x[0]) for name, found in other.items()}
 
 
-def looked_at(pool: Executor, shared: Shared, q0: Floats, v0: Floats, extremes: Extremes) -> tuple[Finding, ...]:
-    """Findings about a few paths: each kind once, for the path with the largest value."""
-    tasks = _examined(shared, q0, v0, extremes)
-    with closing(in_order(pool, _examine, tasks)) as findings:
-        return _worst_of_each_kind(tasks, findings)
+def findings_of_paths(
+    shared: Shared, q0: Floats, v0: Floats, extremes: Extremes, pool: Executor | None
+) -> tuple[Finding, ...]:
+    """Findings about a few paths, each kind once, for the path with the largest value; without a pool in this thread.
 
-
-def looked_at_here(shared: Shared, q0: Floats, v0: Floats, extremes: Extremes) -> tuple[Finding, ...]:
-    """:func:`looked_at` after Ctrl-C, without the workers, which may have stopped; empty after a second Ctrl-C."""
-    tasks = _examined(shared, q0, v0, extremes)
-    try:
-        return _worst_of_each_kind(tasks, map(_examine, tasks))
-    except KeyboardInterrupt:
-        return ()
-
-
-def _examined(shared: Shared, q0: Floats, v0: Floats, extremes: Extremes) -> list[Task]:
-    """The paths to examine, one a task."""
+    Of many paths they are the first, and those with the most split steps, the most energy and the largest speed.
+    """
     if not shared.steps:
-        return []
-    if len(q0) <= _ALL_EXAMINED:
-        paths = list(range(len(q0)))
-    else:
-        split = [path for amount, path in (extremes["split"],) if amount > 0]
-        paths = list(dict.fromkeys([0, *split, extremes["energy"][1], extremes["speed"][1]]))
-    return [Task(shared, path, q0[path : path + 1].copy(), v0[path : path + 1].copy()) for path in paths]
-
-
-def _worst_of_each_kind(tasks: Sequence[Task], findings_of_tasks: Iterable[tuple[Finding, ...]]) -> tuple[Finding, ...]:
+        return ()
+    split = [path for amount, path in (extremes["split"],) if amount > 0]
+    some = [0, *split, extremes["energy"][1], extremes["speed"][1]] if len(q0) > _ALL_EXAMINED else range(len(q0))
+    tasks = [Task(shared, path, q0[path : path + 1].copy(), v0[path : path + 1].copy()) for path in dict.fromkeys(some)]
     found: dict[str, Finding] = {}
-    for task, findings in zip(tasks, findings_of_tasks, strict=True):
-        for finding in findings:
-            kept = found.get(finding.kind)
-            if kept is None or (finding.value or 0.0) > (kept.value or 0.0):
-                found[finding.kind] = finding.about(f"path {task.first}: ")
+    results = (_examine(task) for task in tasks) if pool is None else in_order(pool, _examine, tasks)
+    with closing(results) as results:
+        for task, findings in zip(tasks, results, strict=True):
+            for finding in findings:
+                kept = found.get(finding.kind)
+                if kept is None or (finding.value or 0.0) > (kept.value or 0.0):
+                    found[finding.kind] = finding.about(f"path {task.first}: ")
     return tuple(found.values())
 
 

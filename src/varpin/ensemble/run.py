@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import closing
+from contextlib import closing, suppress
 
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.ensemble.looks import looked_at, looked_at_here
+from varpin.ensemble.looks import findings_of_paths
 from varpin.ensemble.paths import Shared, simulate_paths, without_geometry
 from varpin.ensemble.record import Ensemble, EnsembleInterrupted
 from varpin.ensemble.statistics import Sums
@@ -132,11 +132,14 @@ def simulate_ensemble(
             with closing(in_order(pool, simulate_paths, tasks, result_bytes=sums.part_bytes())) as parts:
                 take_all(parts, sums.add, lambda: progress(sums.done, paths) if progress is not None else None)
             assert sums.done == paths
-            found = looked_at(pool, shared, start[0], start[1], sums.extremes)
+            found = findings_of_paths(shared, start[0], start[1], sums.extremes, pool)
         except (KeyboardInterrupt, WorkersLost) as stop:
             kept = None
             if sums.done:
-                seen = looked_at_here(shared, start[0][: sums.done], start[1][: sums.done], sums.extremes)
+                seen: tuple[Finding, ...] = ()
+                # The workers may have stopped; a second Ctrl-C leaves the examination out.
+                with suppress(KeyboardInterrupt):
+                    seen = findings_of_paths(shared, start[0][: sums.done], start[1][: sums.done], sums.extremes, None)
                 kept = sums.ensemble((*sums.lost(), *seen))
             if isinstance(stop, WorkersLost):
                 raise WorkersLost(stop.__cause__, kept) from stop.__cause__

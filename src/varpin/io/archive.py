@@ -30,7 +30,7 @@ from varpin.finding import Finding
 from varpin.support.checks import is_file, writable
 
 T = TypeVar("T")
-Members = Mapping[str, NDArray[Any]]
+Members = Mapping[str, Any]
 
 
 class Axes:
@@ -102,40 +102,21 @@ _HEADERS: Mapping[tuple[int, int], Callable[..., Any]] = {
 }
 
 
-class Archive(Mapping[str, NDArray[Any]]):
-    """The arrays of an npz file; each is read where it is asked for, so that a wrong shape is found before its data.
+def read_npz(source: Path, form: str | None = None) -> dict[str, Entry]:
+    """The headers of the arrays of an npz file, which must be of the format ``form`` if that is given.
 
-    Attributes:
-        entries: The headers of the arrays, by name.
-    """
-
-    def __init__(self, source: Path) -> None:
-        with _opened(source) as archive:
-            names = [name.removesuffix(".npy") for name in archive.namelist()]
-            self.entries = {name: Entry(source, archive, name) for name in names}
-
-    def __getitem__(self, name: str) -> NDArray[Any]:
-        return np.asarray(self.entries[name])
-
-    def __contains__(self, name: object) -> bool:
-        return name in self.entries
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.entries)
-
-    def __len__(self) -> int:
-        return len(self.entries)
-
-
-def read_npz(source: Path, form: str | None = None) -> Archive:
-    """The arrays of an npz file, which must be of the format ``form`` if that is given.
+    Each array is read where it is asked for, so that a wrong shape is found before its data.
 
     Raises:
         FileError: The file is missing, not npz, truncated or damaged, has pickled objects, or is of another format.
     """
-    members = Archive(source)
-    if form is not None:
-        _require_format(source, members.get("format"), form)
+    with _opened(source) as archive:
+        names = [name.removesuffix(".npy") for name in archive.namelist()]
+        members = {name: Entry(source, archive, name) for name in names}
+    found = str(np.asarray(members.get("format", "")))
+    if form is not None and found != form:
+        what = f"its format is {reprlib.repr(found)}" if found else "it has no format"
+        raise FileError(f"{source} is another kind of file: {what} instead of {form!r}")
     return members
 
 
@@ -145,7 +126,7 @@ def read_format(source: Path) -> str:
     Raises:
         FileError: As :func:`read_npz`.
     """
-    return str(Archive(source).get("format", ""))
+    return str(np.asarray(read_npz(source).get("format", "")))
 
 
 @contextlib.contextmanager
@@ -164,12 +145,6 @@ def _opened(source: Path) -> Iterator[zipfile.ZipFile]:
     # On a damaged archive zipfile, zlib and NumPy raise many kinds of errors.
     except Exception as error:
         raise FileError(f"{source} is not an npz file, or it is truncated or damaged: {error}") from None
-
-
-def _require_format(source: Path, found: object, form: str) -> None:
-    if str(found) != form:
-        what = "it has no format" if found is None else f"its format is {reprlib.repr(str(found))}"
-        raise FileError(f"{source} is another kind of file: {what} instead of {form!r}")
 
 
 def members_of(record: Any, prefix: str = "") -> dict[str, Any]:
@@ -232,16 +207,15 @@ class _Builder:
         for item in fields(kind):
             key, hint = _entry(item), _required(hints[item.name])
             name = prefix + key
-            entries: Mapping[str, Any] = members.entries if isinstance(members, Archive) else members
             below = {
                 member.removeprefix(f"{name}."): entry
-                for member, entry in entries.items()
+                for member, entry in members.items()
                 if member.startswith(f"{name}.")
             }
             if is_dataclass(hint) and below:
                 tables[key] = self.tables(hint, members, f"{name}.")
-            elif name in entries:
-                tables[key] = entries[name]
+            elif name in members:
+                tables[key] = members[name]
             elif typing.get_origin(hint) is Mapping or below:
                 tables[key] = below
         return tables

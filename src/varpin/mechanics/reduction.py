@@ -32,7 +32,7 @@ class Required:
         joints: The computed joints.
         locked: Joints that are locked, and their positions [rad or m]: their links are part of others.
         idle: Joints that stay at rest and are left out, and their positions [rad or m].
-        parts: The computed joints in independent groups; a plan may treat each group separately.
+        parts: The computed joints in independent groups.
         coupled: Why groups are planned together although they share no inertia; empty if they are not.
         terms: Description of each possible effect, by its name.
     """
@@ -57,9 +57,9 @@ class Required:
             if joints:
                 rows.append((title, listed(f"{joint} at {at}" for joint, at in joints.items())))
         if len(self.parts) > 1:
-            rows.append(("planned apart", "; ".join(listed(part) for part in self.parts)))
+            rows.append(("independent", "; ".join(listed(part) for part in self.parts)))
         if self.coupled:
-            rows.append(("planned together", self.coupled))
+            rows.append(("coupled", self.coupled))
         return [*rows, *self.terms.items()]
 
     def _repr_html_(self) -> str:

@@ -216,12 +216,11 @@ def _csv(path: Path) -> dict[str, Floats]:
 
 def _npz(path: Path) -> dict[str, Floats]:
     """The columns of an npz file: arrays of one length, or the joint positions of a saved trajectory."""
-    arrays = read_npz(path)
-    found: dict[str, Any] = dict(arrays.entries)
+    found: dict[str, Any] = dict(read_npz(path))
     if {"t", "q", "joint_names"} <= found.keys():
-        joints = [str(name) for name in arrays["joint_names"].reshape(-1)]
+        joints = [str(name) for name in np.ravel(found["joint_names"])]
         if len(found["q"].shape) == 2 and found["q"].shape[1] == len(joints):
-            found = {"t": found["t"]} | dict(zip(joints, arrays["q"].T, strict=True))
+            found = {"t": found["t"]} | dict(zip(joints, np.asarray(found["q"]).T, strict=True))
     length = found["t"].shape if "t" in found else ()
     for name, column in found.items():
         if column.dtype.kind not in "fi" or len(column.shape) != 1 or column.shape != length:

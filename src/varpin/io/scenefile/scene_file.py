@@ -32,8 +32,6 @@ from varpin.support.checks import count, positive
 from varpin.support.markup import facts
 from varpin.trajectory import Trajectory
 
-# Measured time to set up a part, in units of linear algebra: the cube of the number of joints, times steps.
-_SETUP = 200_000
 _OPTIONS = ("tolerance", "max_iterations", "second_order", "forward", "regularization", "true_cost")
 
 
@@ -80,11 +78,6 @@ class SceneFile:
         """The robot, without the joints that are left out."""
         return self.scene.robot
 
-    @property
-    def driven(self) -> bool:
-        """Whether anything but gravity and springs acts in a simulation."""
-        return not self.scene.conservative or self._task.controls is not None or self._seed is not None
-
     @cached_property
     def integrator(self) -> Integrator:
         """The integrator of the file.
@@ -105,9 +98,7 @@ class SceneFile:
         Raises:
             SceneFileError: The file has no cost, or a cost does not fit the robot.
         """
-        return self._problem(self._task)
-
-    def _problem(self, task: Task) -> OptimalControlProblem:
+        task = self._task
         if not task.tables.get("cost"):
             raise task.where.at("cost").error("is missing; a scene to solve needs at least one [[cost]]")
         task.require_start()
@@ -170,18 +161,13 @@ class SceneFile:
         controls: LinearPolicy | Solution | Floats | None = None,
         *,
         resume: Solution | None = None,
-        apart: bool | None = None,
         **options: Any,
     ) -> Solution:
         """The optimal motion, by :func:`varpin.solve` with the options of ``[solve]``.
 
-        Independent groups of joints are planned separately; their plans then start one solve of the whole problem.
-
         Args:
             controls: Initial controls, as for :func:`varpin.solve`.
             resume: A solution to continue from.
-            apart: Whether to plan groups separately; if left out, where that saves time. Not used with ``controls`` or
-                ``resume``.
             **options: Options of :func:`varpin.solve` that replace those of the file.
 
         Raises:
@@ -190,8 +176,6 @@ class SceneFile:
         """
         given = self._options | options
         try:
-            if controls is None and resume is None and (self._pays_apart() if apart is None else apart):
-                controls = self._planned_apart(given)
             return solve(self.problem, controls, resume=resume, **given)
         except InputError as error:
             where = self._task.where.at("solve")
@@ -199,31 +183,6 @@ class SceneFile:
             if wrong.key == where.key:
                 raise
             raise wrong from None
-
-    def _pays_apart(self) -> bool:
-        """Whether planning groups separately saves more linear algebra than setting up the parts costs."""
-        parts = self.required.parts
-        saved = self.robot.dof**3 - sum(len(part) ** 3 for part in parts)
-        return len(parts) > 1 and self.steps * saved > _SETUP * len(parts)
-
-    def _planned_apart(self, options: dict[str, Any]) -> LinearPolicy | None:
-        """The policies of all groups of joints in one; None where a group is no problem of its own."""
-        names, n, problem, whole = self.robot.joint_names, self.robot.dof, self.problem, self._task
-        tasks = [whole.without([name for name in names if name not in part]) for part in self.required.parts]
-        # A part of several robots does not have all of them.
-        odd = self.robot.parts or problem.linear or problem.constraints
-        if odd or not all(task.driven and task.terms for task in tasks):
-            return None
-        R, m = problem.decisions, self.scene.controls
-        u, gains, reference = np.zeros((R, m)), np.zeros((R, m, 2 * n)), np.zeros((R, 2 * n))
-        for task in tasks:
-            plan = solve(self._problem(task), **{**options, "true_cost": None}, check=False).policy
-            rows = np.array([whole.driven.index(name) for name in task.driven])
-            order = np.array([names.index(name) for name in task.scene.robot.joint_names])
-            x = np.concatenate([order, n + order])
-            u[:, rows], reference[:, x] = plan.u, plan.reference
-            gains[:, rows[:, None], x] = plan.gains
-        return LinearPolicy(u, gains, reference, hold=plan.hold, on=plan.on, period=plan.period)
 
     def marks(self, duration: float | None = None) -> Marks:
         """The task in a replay: ``replay(robot, motion, marks=scene.marks())``.

@@ -248,8 +248,6 @@ def required_of(task: Task, *, idle: bool) -> tuple[Task, Required]:
         out = idle_joints(scene, task.q0, task.v0, controls if scene.controls else None, busy)
     part = task.without(list(out))
     told = report(part.scene, scene, out)
-    if any(term.kind == "center_of_mass" for term in part.terms) and len(told.parts) > 1:
-        told = replace(told, parts=(told.joints,), coupled="the cost has a term on the whole robot (center_of_mass)")
     costs = [term.kind + (" at the end" if term.terminal else "") for term in part.terms]
     words = dict.fromkeys(place.kind(given, kinds.PLAN_CONSTRAINTS)[0] for place, given in kept)
     terms = {
@@ -545,16 +543,12 @@ def _term(where: Where, table: Any, task: Task, horizon: tuple[float, float]) ->
 
 
 def _require_controls(task: Task) -> None:
-    """Refuse controls of a simulation that are positions in degrees, or beyond limits."""
+    """Refuse forces of a simulation beyond the limits."""
     if not isinstance(task.controls, Timeline):
         return
-    place, robot = task.where.at("simulate", "controls"), task.scene.robot
-    given = task.controls.at(task.times)
-    worst = given[np.abs(given).argmax(axis=0), np.arange(given.shape[1])]
-    free = ~task.positions | robot.slides[[robot.coordinate(joint) for joint in task.driven]]
-    place.refuse_degrees(worst, task.driven, free.tolist())
-    force, limit = np.abs(given * task.gear), np.where(task.positions, np.inf, task.torque_limit)
+    force = np.abs(task.controls.at(task.times) * task.gear).max(axis=0)
+    limit = np.where(task.positions, np.inf, task.torque_limit)
     if (force > limit * (1.0 + _ROUNDING)).any():
-        k = int(np.argmax((force - limit).max(axis=0)))
-        told = f"reach {force[:, k].max():g} N m or N; torque_limit is {limit[k]:g}"
-        raise place.error(f"of {task.driven[k]!r} {told}")
+        k = int(np.argmax(force - limit))
+        told = f"of {task.driven[k]!r} reach {force[k]:g} N m or N; torque_limit is {limit[k]:g}"
+        raise task.where.at("simulate", "controls").error(told)
