@@ -312,15 +312,6 @@ def follow(scene, told, integrator, duration, start, controls=None, again=1):
     pytest.fail(told)
 
 
-@pytest.mark.parametrize("dt", [0.05, 0.7 / 12, 1.0 / 18])
-@pytest.mark.parametrize("integrator", [MIDPOINT, EULER])
-def test_a_named_step_divides_the_duration_as_it_is_written(dt, integrator):
-    duration = dt * round(0.8 / dt)
-    motion = vp.simulate(FREE, Q0, V0, duration=duration, dt=dt, integrator=integrator)
-    (told,) = about(motion.warnings, "error")
-    follow(FREE, told, integrator, duration, (Q0, V0), again=4)
-
-
 def test_a_named_step_keeps_the_period_of_a_law_and_of_a_policy():
     scene, wish = vp.Scene(vp.planar_chain(2)), np.array([0.6, -0.4])
     options = {"q0": [0.0, 0.0], "v0": [8.0, 0.0], "duration": 1.2, "integrator": vp.Midpoint()}
@@ -365,6 +356,16 @@ def test_of_stops_within_a_step_a_step_that_resolves_them_is_named(links, dampin
         assert "Stops are stiffer" in told
         assert "integrator" not in told
         follow(scene, told, integrator, 1.0, start, again=2)
+
+
+@pytest.mark.parametrize("stiffness", [3e4, 1e5])
+def test_the_step_named_for_a_stop_is_as_long_as_its_spring_allows(stiffness):
+    """Two radians of a mass of 1 kg on it."""
+    scene = vp.Scene(slider(1.0), gravity=False, forces=vp.JointStop(stiffness, 0.0, -1.0, 1.0, 1e-4))
+    motion = vp.simulate(scene, [0.0], [1.0], dt=0.05, steps=40, integrator=MIDPOINT)
+    (told,) = about(motion.warnings, "error")
+    named = float(re.search(r"dt = (\S+)", told)[1])
+    assert 1.0 < named * np.sqrt(stiffness) <= 2.0
 
 
 def test_limits():
@@ -500,12 +501,6 @@ def test_friction_that_turns_in_a_step_is_repeated_on_either_side():
         assert motion.error_bound is None
 
 
-def test_one_step_has_a_bound():
-    scene = vp.Scene(slider(1.0), gravity=False, stiffness=30.0)
-    motion = vp.simulate(scene, [0.3], [1.0], dt=0.01, steps=1, integrator=RK4)
-    assert motion.error.max() < motion.error_bound < 10.0 * motion.error.max()
-
-
 def test_a_joint_that_hardly_turns_is_measured_by_the_others():
     scene = vp.Scene(vp.planar_chain(2), gravity=False, stiffness=[0.0, 1e3])
     assert not vp.simulate(scene, [0.0, 4e-5], [1.0, 0.0], dt=0.02, steps=50, integrator=MIDPOINT).warnings
@@ -553,17 +548,6 @@ def test_a_ramp_is_the_polynomial_of_two_stages():
     ramp = vp.OpenLoop(lambda t: [t - 0.5])
     motion = vp.simulate(SLIDER, [0.3], [0.0], dt=0.1, steps=10, controls=ramp, integrator=vp.Gauss(2))
     assert motion.error_bound is not None
-
-
-def test_efforts_within_a_step_are_told_on_either_side():
-    scene, told = vp.Scene(vp.load_robot("ur5"), gravity=False), []
-    for sign in (1.0, -1.0):
-        push = vp.OpenLoop(lambda t, sign=sign: sign * np.array([0, 0, 0, 0, 0, 28.0 + 400.0 * (t % 0.01)]))
-        rest = np.zeros(6)
-        motion = vp.simulate(scene, rest, rest, dt=0.01, steps=3, controls=push, integrator=vp.Gauss(3))
-        told.append([finding.value for finding in about(motion.warnings, "effort limits")])
-    assert told[0]
-    assert told[0] == pytest.approx(told[1])
 
 
 def test_a_blow_within_a_step_is_held_against_the_limit_of_efforts():

@@ -25,9 +25,7 @@ def exact(number, times=17):
     """A loop without controls, a state in it, and its motion by DOP853 at 1e-12."""
     loop = LOOPS[number]()
     assert loop.controls is None
-    q = vp.assemble(loop.scene, loop.start)
-    v = along_constraints(loop.scene, q, loop.push)
-    return loop, q, v, loop.dynamics().motion(q, v, np.linspace(0.0, loop.duration, times), stiff=loop.stiff)[0]
+    return loop, *loop.state(), loop.motion(times)[0]
 
 
 @pytest.mark.parametrize("number", [0, 13, 14])

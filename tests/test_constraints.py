@@ -201,7 +201,7 @@ def tangent(scene, q, v):
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.Gauss(3)])
-def test_linearizations_are_symplectic_along_the_constraints(integrator):
+def test_steps_are_symplectic_along_the_constraints_and_go_back(integrator):
     scene, q, v = loop("five-bar")
     motion = vp.simulate(scene, q, v, dt=0.02, steps=6, integrator=integrator)
     lin = vp.linearize(scene, motion)
@@ -214,6 +214,8 @@ def test_linearizations_are_symplectic_along_the_constraints(integrator):
     assert np.abs(T.T @ (A.T @ J @ A - J) @ T).max() < 1e-12
     assert np.abs(A.T @ J @ A - J).max() > 0.1
     assert np.linalg.matrix_rank(A, tol=1e-9) == 2 * (n - 2)
+    back = vp.simulate(scene, motion.q[-1], -motion.v[-1], dt=0.02, steps=6, integrator=integrator)
+    np.testing.assert_allclose(back.q[::-1], motion.q, atol=1e-12)
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(3)])

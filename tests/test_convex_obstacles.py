@@ -269,6 +269,6 @@ def test_an_srdf_of_another_robot_is_refused(tmp_path):
     with refused(vp.InputError, "KeepClear srdf", "itself=True"):
         ball = vp.Obstacle.sphere([3, 0, 3], 0.1)
         vp.KeepClear(robot, [ball], links=list(capsules), capsules=capsules, srdf=tmp_path / "arm.srdf")
-    for disabled, facts in [((("panda_link1", "panda_link4"),), ("'panda_link1'",)), ((), ("no pairs",))]:
-        with refused(vp.InputError, "arm.srdf", repr(robot.name), *facts):
+    for disabled in ((("panda_link1", "panda_link4"),), ()):
+        with refused(vp.InputError, "arm.srdf", repr(robot.name)):
             pairs(*disabled)

@@ -23,7 +23,6 @@ from varpin.core import (
     linearize_explicit,
 )
 from varpin.core.arrays import ConstraintRows, new_nodes
-from varpin.model.kinematics import links
 from varpin.signals.commands import open_loop
 
 rng = np.random.default_rng(3)
@@ -263,7 +262,7 @@ class TestRollouts:
     ],
 )
 def test_what_are_no_links_is_refused(change, facts):
-    own = links(vp.planar_chain(2).tree)
+    own = vp.planar_chain(2).tree
     names = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio", "offset", "mass", "center")
     with refused(ValueError, facts):
         Links.make(**({name: getattr(own, name) for name in names} | change), dof=2)

@@ -90,47 +90,6 @@ def test_a_stiff_stop():
         assert motion.integrator == "Gauss(stages=4)"
 
 
-def test_a_law_is_called_once_a_period_and_is_ready_for_stops():
-    scene, q0, v0, controls = stopped()
-    calls = []
-
-    def law(t, q, v):
-        calls.append(t)
-        return controls[len(calls) - 1]
-
-    motion = vp.simulate(scene, q0, v0, dt=DT, steps=STEPS, controls=law)
-    assert len(calls) == STEPS
-    assert motion.integrator == "Radau(stages=4)"
-    np.testing.assert_array_equal(motion.q, vp.simulate(scene, q0, v0, dt=DT, steps=STEPS, controls=controls).q)
-
-
-def test_scene_files(tmp_path):
-    """A file without an integrator makes the motion of ``simulate``."""
-    path = tmp_path / "stop.toml"
-    path.write_text(
-        """
-gravity = false
-[robot]
-source = "double_pendulum"
-[[force]]
-type = "stop"
-stiffness = 1e3
-damping = 300.0
-width = 0.05
-lower = -9.0
-upper = 0.5
-[initial]
-v = [0.0, 2.0]
-[horizon]
-dt = 0.01
-steps = 100
-"""
-    )
-    file = vp.load_scene(path, required_only=False)
-    assert file.integrator.same_map(vp.Radau(4))
-    assert file.simulate().integrator == "Radau(stages=4)"
-
-
 def test_paths_without_noise_are_those_of_simulate():
     """Of one start, and of many of which some ask for more."""
     scene, q0, v0, controls = stopped()

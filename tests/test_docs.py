@@ -217,3 +217,10 @@ def test_every_public_name_is_on_one_page_of_the_api():
 def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#:]+)[)#]", text_of(page)):
         assert ((DOCS / page).parent / target).exists(), target
+
+
+def test_the_list_of_slow_tests_names_tests(request):
+    names = set((Path(__file__).parent / "slow.txt").read_text(encoding="utf-8").splitlines())
+    if request.config.args_source is not pytest.Config.ArgsSource.TESTPATHS:
+        pytest.skip("some tests are not collected")
+    assert names <= {item.nodeid for item in request.session.items}

@@ -272,11 +272,6 @@ def test_a_motion_that_takes_too_long_is_judged_by_what_there_is(hasty):
 # --- the record ----------------------------------------------------------------------------------------------------
 
 
-def small_battery(load):
-    trials = battery.trials_on(load("finger"))
-    return [trial for trial in trials if trial.name == "falls, dt = 0.5 s"]
-
-
 def test_every_trial_has_a_name_of_its_own(load):
     for trials in (battery.TRIALS, battery.trials_on(load("finger"))):
         names = [trial.name for trial in trials]
@@ -392,50 +387,6 @@ def test_nothing_on_the_finger_is_silent_wrong(load):
     counts = record.counts()
     assert counts[Kind.ACCURATE] > 60
     assert counts[Kind.DEGRADED] > 30
-
-
-@pytest.fixture(scope="module")
-def benchmark(script):
-    return script("extremes")
-
-
-def test_random_trees_are_many_kinds(benchmark):
-    trees = [benchmark.robot_of(f"tree{seed}") for seed in range(benchmark.TREES // 4)]
-    assert {tree.dof for tree in trees} == set(range(2, 9))
-    assert 0.1 < np.mean([bool((np.diff(tree.tree.parent) == 1).all()) for tree in trees]) < 0.9
-    assert len({benchmark.robot_of("tree3").tree.mass.tobytes(), trees[3].tree.mass.tobytes()}) == 1
-    every = {trial.name for trial in battery.trials_on(trees[0])}
-    own = [
-        {trial.name for trial in benchmark.trials_of(f"tree{k}", trees[k], benchmark.TURNS)}
-        for k in range(benchmark.TURNS)
-    ]
-    assert set.union(*own) == every
-    assert sum(map(len, own)) == len(every)
-
-
-def test_the_table_of_robots_counts_every_cell(benchmark, load, tmp_path):
-    robot, members = load("finger"), [vp.Midpoint(), vp.RungeKutta4()]
-    record = battery.run(robot, trials=small_battery(load), integrators=members)
-    rows = list(benchmark.table([("finger", robot, record), ("tree1", robot, record), ("twin", robot, "finger")]))
-    assert rows[2].startswith("| finger | 3 | 2 | ")
-    assert rows[3].startswith("| twin | 3 | the same mechanism as finger |")
-    assert rows[4].startswith("| 1 random trees | 3 |")
-    assert rows[5].startswith("| all |  | 4 | ")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["double_pendulum", "z1", "xarm7", *(f"tree{20 * k + k}" for k in range(10))])
-def test_nothing_on_robots_and_trees_is_silent_wrong(benchmark, name):
-    robot = benchmark.robot_of(name)
-    trials = (
-        benchmark.trials_of(name, robot, benchmark.TURNS)
-        if name.startswith("tree")
-        else battery.trials_on(robot)[:: benchmark.TURNS]
-    )
-    record = battery.run(robot, trials=trials)
-    assert record.missing == 0
-    assert [(cell.trial, cell.integrator, cell.found) for cell in record.wrong()] == []
-    assert record.counts()[Kind.ACCURATE] > 0
 
 
 def test_needless_warnings_are_counted(worried):

@@ -33,12 +33,6 @@ def test_text_makes_it_again(made):
     assert type(made) is BY_NAME[type(made).__name__]
 
 
-@pytest.mark.parametrize("made", MADE, ids=str)
-def test_text_is_python(made):
-    found = eval(f"vp.{made}", {"vp": vp} | vars(vp))
-    assert (found() if isinstance(found, type) else found) == made
-
-
 def test_words_without_quotes_are_taken_too():
     """As on the command line, and in older files of motions."""
     assert integrator_of("Midpoint(alpha=0.5, kick=held)") == vp.Midpoint(kick="held")

@@ -122,11 +122,3 @@ def test_what_is_printed_counts_the_warnings(arm):
         motion = vp.simulate(scene, [0.0], [speed], dt=1e-2, steps=90, controls=[pull])
         assert repr(motion).endswith(text)
         assert ("warning" in repr(motion)) == bool(motion.warnings)
-    cost = vp.ControlCost(1e-6) + vp.Terminal(vp.TrackingCost([0.6], 1e3) + vp.VelocityCost(1.0))
-    problem = vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=0.1, steps=10)
-    plan = vp.solve(problem)
-    assert len(plan.warnings) == 1
-    assert repr(plan).endswith(f"{plan.status.value}, 1 warning)")
-    run = vp.Mpc(problem).run(duration=1.0)
-    assert run.warnings
-    assert repr(run).endswith(f", {len(run.warnings)} warning{'s' * (len(run.warnings) > 1)})")

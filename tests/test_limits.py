@@ -53,21 +53,6 @@ def test_sliders_on_sliders_keep_their_digits_far_out():
         np.testing.assert_allclose(getattr(far, name), getattr(near, name), rtol=0, atol=1e-13, err_msg=name)
 
 
-def test_branches_on_sliders_agree_with_pinocchio():
-    """Two pendulums side by side on the second of two sliders, and one on the first."""
-    model, joints = pin.Model(), [0]
-    for parent, kind in ((0, "PX"), (1, "PZ"), (2, "RY"), (3, "RX"), (2, "RZ"), (1, "RX"), (6, "PY")):
-        placement = pin.SE3.Random() if parent else pin.SE3.Identity()
-        joints.append(model.addJoint(joints[parent], getattr(pin, f"JointModel{kind}")(), placement, f"j{len(joints)}"))
-        model.appendBodyToJoint(joints[-1], pin.Inertia.Random(), pin.SE3.Identity())
-    scene = vp.Scene(vp.load_robot(model))
-    rng = np.random.default_rng(3)
-    q, v = rng.normal(size=7), rng.normal(size=7)
-    fast, slow = (vp.lagrangian_jet(scene, q, v, backend=backend) for backend in ("compiled", "pinocchio"))
-    for name in ("L", "Lq", "Lv", "Lqq", "Lvq", "Lvv"):
-        np.testing.assert_allclose(getattr(fast, name), getattr(slow, name), rtol=0, atol=1e-11, err_msg=name)
-
-
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)])
 def test_a_million_turns_change_nothing(integrator):
     """A double pendulum that starts a million turns on swings as at home, and shows the turns."""
@@ -167,12 +152,6 @@ def test_a_heavy_wheel_does_not_hide_what_it_carries(dt):
         energies.append(relative @ jet.Lvv @ relative - jet.L - 0.5 * rate**2 * jet.Lvv[0, 0])
     unit = GRAVITY * 4 / 2
     assert np.abs(np.array(energies) - energies[0]).max() < 0.1 * unit
-
-
-@pytest.mark.parametrize("name", ["finger", "ur5", "xarm7"])
-def test_ordinary_arms_carry_nothing_light(name):
-    """They do not pay for the balances of light parts."""
-    assert vp.load_robot(name).tree.loads.size == 0
 
 
 @pytest.mark.slow

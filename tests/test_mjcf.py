@@ -282,10 +282,6 @@ def test_urdf_of_another_suffix_and_sdf(tmp_path, load):
     path.write_text(load("ur5").urdf.read_text())
     expected = pin.buildModelFromUrdf(str(path))
     assert [inertia.mass for inertia in vp.load_robot(path).model.inertias] == [i.mass for i in expected.inertias]
-    for name in ("arm.sdf", "arm.xml"):
-        (tmp_path / name).write_text('<sdf version="1.6"><model name="a"/></sdf>')
-        with refused(vp.RobotError, "SDF"):
-            vp.load_robot(tmp_path / name)
 
 
 def test_planes_are_plates_and_those_without_an_edge_are_left_out(tmp_path):

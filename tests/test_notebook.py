@@ -83,7 +83,7 @@ def objects(robot):
     advice = vp.Advice((choice, other), "arm", True, 1e-5, None, 0.1, "Take <Gauss>.\nIt is enough.")
     runs = [
         vp.WorkPrecisionRun(
-            integrator=f"{NAMES[0]} {k}", order=2, dt=0.01 * k, steps=10, seconds=1.0 / k, spread=0.0,
+            integrator=f"{NAMES[0]} {k}", order=2, dt=0.01 * k, steps=10, seconds=1.0 / k,
             error=0.1 * k, energy_error=np.nan, newton_iterations=1, jets=1, sweeps=1,
             split_steps=0,
         )

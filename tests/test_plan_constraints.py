@@ -472,7 +472,7 @@ def test_reach_bounds_where_a_frame_gets(name):
     rng = np.random.default_rng(0)
     q = rng.uniform(np.maximum(lower, -7.0), np.minimum(upper, 7.0), (4000, robot.dof))
     places = kinematics.placements(q)[1]
-    root = kinematics.links.translation[0]
+    root = kinematics.links.tree.translation[0]
     away = np.linalg.norm(places - root, axis=1)
     most = reach(robot, kinematics)
     assert away.max() <= most < 1.4 * away.max()

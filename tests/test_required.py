@@ -103,9 +103,6 @@ def test_fingers_are_independent(tmp_path):
     ("text", "integrator"),
     [
         ('type = "gauss"\nstages = 3\nkick = "split"', vp.Gauss(stages=3, kick="split")),
-        ('type = "explicit_euler"', vp.ExplicitEuler()),
-        ('type = "semi_implicit_euler"', vp.SemiImplicitEuler()),
-        ('type = "runge_kutta_4"', vp.RungeKutta4()),
         ('type = "midpoint"\nalpha = 0.3\nkick = "split"', vp.Midpoint(alpha=0.3, kick="split")),
     ],
 )

@@ -61,10 +61,9 @@ def test_a_checked_linearization_has_a_verdict():
     assert about(str(good).splitlines()[-1], "right derivatives")
     coarse = vp.check_linearization(vp.Scene(chain, damping=0.1), q, v, dt=1e-2, step=1.0)
     assert not coarse.holds
-    assert about(str(coarse), "another difference", "wrong derivatives")
+    assert about(str(coarse), "another difference")
     wrong = type(good)(A=good.A, B=(0.5, 1.0), G=good.G)
-    (verdict,) = about(str(wrong).splitlines()[-1], "wrong derivatives")
-    assert not unnamed(verdict, "B", "5.0e-01")
+    assert not unnamed(str(wrong).splitlines()[-1], "B", "5.0e-01")
 
 
 @pytest.mark.parametrize(

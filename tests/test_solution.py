@@ -248,15 +248,6 @@ def test_monte_carlo_interrupted_holds_the_paths_done():
     kept = caught.value.result.paths
     assert seen[0][0] <= kept < 6000
     assert sol.monte_carlo(kept, 5, workers=2) == caught.value.result
-    own = vp.CustomNoise(lambda q, v, u: 0.1 * np.eye(2), 2)
-
-    def stop_at_once(done, paths):
-        raise KeyboardInterrupt
-
-    # One path has no standard error.
-    with refused(vp.MonteCarloInterrupted, "0 paths") as caught:
-        vp.solve(small(noise=own)).monte_carlo(5, 0, progress=stop_at_once)
-    assert caught.value.result is None
 
 
 @pytest.mark.slow

@@ -43,6 +43,13 @@ def test_refined_increments_are_wiener_increments_of_half_the_step():
     assert abs((middle**2).mean() - 0.25 * dt) < 4.0 * 0.25 * dt * np.sqrt(2.0 / N)
 
 
+@pytest.mark.parametrize("factor", [1, 2, 3])
+def test_coarse_increments_are_sums(factor):
+    dw = np.arange(12.0).reshape(6, 2) ** 2
+    sums = [[sum(dw[k * factor + i, c] for i in range(factor)) for c in range(2)] for k in range(6 // factor)]
+    np.testing.assert_array_equal(coarsen(dw, factor), sums)
+
+
 @pytest.mark.parametrize(
     ("call", "facts"),
     [
@@ -234,73 +241,31 @@ def test_no_correction_where_fields_do_not_depend_on_the_velocity(part):
     assert motions[0].p.tobytes() == motions[1].p.tobytes()
 
 
-class Pendulum:
-    """A hanging rod of 1 m and 1 kg, as ``planar_chain(1)``."""
-
-    def mass(self, q):
-        return np.full((len(q), 1, 1), 1.0 / 3.0)
-
-    def force(self, q, v):
-        return 0.5 * 9.81 * np.cos(q)
+PATHS, HOT = 64, 2.0
 
 
-PATHS = 64
+def mean_energy(friction, kick, dt, duration):
+    """The mean of p v / kT of a hanging rod of 1 m and 1 kg in a bath, over time and paths, and its standard error.
 
-
-class Bath:
-    """A robot at temperature ``heat`` [J], each joint damped by ``friction`` [1/s] times a typical inertia of it."""
-
-    def __init__(self, friction):
-        rng = np.random.default_rng(4)
-        robot, self.heat, inertia = vp.planar_chain(1), 2.0, np.array([1.0 / 3.0])
-        self.equations = Pendulum()
-        q = rng.uniform(-np.pi, np.pi, (4000, 1))
-        weight = np.exp(0.5 * 9.81 * np.sin(q[:, 0]) / self.heat)
-        self.damping = friction * inertia
-        strength = np.sqrt(2.0 * self.damping * self.heat)
-        self.scene = vp.Scene(robot, damping=self.damping, noise=vp.AdditiveNoise(strength))
-        # Starts from the canonical law, by rejection, so that nothing has to burn in.
-        self.q = q[rng.uniform(size=4000) < weight / weight.max()][:PATHS]
-        M = self.equations.mass(self.q)
-        noise = rng.normal(scale=np.sqrt(self.heat), size=self.q.shape)
-        self.p = np.einsum("Pij,Pj->Pi", np.linalg.cholesky(M), noise)
-        self.v = np.linalg.solve(M, self.p[:, :, None])[:, :, 0]
-
-    def estimate(self, averages):
-        """Mean and standard error of p'M^-1 p / (n kT) over the paths' averages of p'M^-1 p."""
-        averages = averages / (self.heat * self.q.shape[1])
-        return averages.mean(), averages.std(ddof=1) / np.sqrt(PATHS)
-
-    def simulated(self, kick, dt, duration):
-        """In pieces, whose paths fit into memory."""
-        rng, q, v, averages = np.random.default_rng(1), self.q, self.v, 0.0
-        for _ in range(20):
-            piece = vp.simulate_ensemble(
-                self.scene, q, v, dt=dt, steps=round(duration / 20 / dt), paths=PATHS, rng=rng,
-                integrator=vp.Midpoint(kick=kick),
-            )  # fmt: skip
-            q, v = piece.q[:, -1], piece.v[:, -1]
-            averages = averages + (piece.p[:, 1:] * piece.v[:, 1:]).sum(axis=2).mean(axis=1) / 20
-        return self.estimate(averages)
-
-    def euler_maruyama(self, dt, duration):
-        """Explicit in everything."""
-        rng, q, p, total, steps = np.random.default_rng(1), self.q, self.p, np.zeros(PATHS), round(duration / dt)
-        with np.errstate(all="ignore"):
-            for _ in range(steps):
-                v = np.linalg.solve(self.equations.mass(q), p[:, :, None])[:, :, 0]
-                total += (p * v).sum(axis=1)
-                kick = np.sqrt(2.0 * self.damping * self.heat * dt) * rng.normal(size=p.shape)
-                q, p = q + dt * v, p + dt * (self.equations.force(q, v) - self.damping * v) + kick
-        return self.estimate(total / steps)
-
-
-def test_the_equations_in_numpy_are_those_of_the_robot():
-    bath = Bath(1.0)
-    for k in range(4):
-        jet = vp.lagrangian_jet(bath.scene, bath.q[k], bath.v[k], backend="pinocchio")
-        np.testing.assert_allclose(bath.equations.mass(bath.q)[k], jet.Lvv, rtol=1e-12)
-        np.testing.assert_allclose(bath.equations.force(bath.q, bath.v)[k], jet.Lq, rtol=1e-9)
+    It is damped by ``friction`` [1/s] times its inertia.
+    """
+    rng, inertia = np.random.default_rng(4), np.array([1.0 / 3.0])
+    q = rng.uniform(-np.pi, np.pi, (4000, 1))
+    weight = np.exp(0.5 * 9.81 * np.sin(q[:, 0]) / HOT)
+    # Starts from the canonical law, by rejection, so that nothing has to burn in.
+    q = q[rng.uniform(size=4000) < weight / weight.max()][:PATHS]
+    v = rng.normal(scale=np.sqrt(HOT / inertia), size=q.shape)
+    damping = friction * inertia
+    scene = vp.Scene(vp.planar_chain(1), damping=damping, noise=vp.AdditiveNoise(np.sqrt(2.0 * damping * HOT)))
+    rng, energy, steps = np.random.default_rng(1), 0.0, round(duration / 20 / dt)
+    # In pieces, whose paths fit into memory.
+    for _ in range(20):
+        piece = vp.simulate_ensemble(
+            scene, q, v, dt=dt, steps=steps, paths=PATHS, rng=rng, integrator=vp.Midpoint(kick=kick)
+        )
+        q, v = piece.q[:, -1], piece.v[:, -1]
+        energy = energy + (piece.p[:, 1:] * piece.v[:, 1:]).sum(axis=2).mean(axis=1) / HOT / 20
+    return energy.mean(), energy.std(ddof=1) / np.sqrt(PATHS)
 
 
 # The left kick leaves nodes cold by dt * damping / inertia, so its limit shows at weak friction.
@@ -308,13 +273,6 @@ def test_the_equations_in_numpy_are_those_of_the_robot():
 @pytest.mark.parametrize(("dt", "duration"), [pytest.param(5e-3, 200.0, marks=pytest.mark.slow), (2e-2, 400.0)])
 def test_langevin_equipartition(kick, friction, dt, duration):
     """The time average of p'M^-1 p is n kT within 4 standard errors."""
-    mean, error = Bath(friction).simulated(kick, dt, duration)
+    mean, error = mean_energy(friction, kick, dt, duration)
     assert error < 0.05
     assert abs(mean - 1.0) < 4.0 * error
-
-
-def test_euler_maruyama_heats_up_where_the_midpoint_rule_does_not():
-    bath = Bath(0.05)
-    mean, error = bath.simulated("split", 5e-2, 100.0)
-    assert abs(mean - 1.0) < 4.0 * error
-    assert bath.euler_maruyama(5e-2, 100.0)[0] > 10.0

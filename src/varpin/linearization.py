@@ -18,11 +18,14 @@ from varpin.integrators.base import diffusion_and_drift, noise_fields
 from varpin.integrators.registry import require_motion, require_scene_of
 from varpin.mechanics.noise import Fields
 from varpin.mechanics.scene import Scene, require_scene
+from varpin.signals.commands import open_line, open_loop
 from varpin.simulation.spectrum import fastest_rate
 from varpin.support.checks import as_floats, finite_array
 from varpin.support.differences import slopes
 from varpin.trajectory import Trajectory
 
+# Difference of the end of a step from the recorded one, as a share of its change of velocity: rounding.
+_SAME = 1e-5
 # Rates of damping, times the step, from which the stationary variance of a damped velocity is wrong by a tenth: where
 # the whole impulse precedes the step, and where it is held over the step or split.
 _BEFORE, _WITHIN = 0.1, 1.1
@@ -154,12 +157,8 @@ def linearize_steps(
     it. ``ramps`` asks for the derivatives in controls that change within a step.
     """
     n, m, steps = scene.robot.dof, scene.controls, trajectory.steps
-    ramp = None
-    if ramps:
-        Jx, Jf, Jk, in_ramp = integrator.linearize_with_ramps(scene, trajectory)
-        ramp = in_ramp @ scene.transmission
-    else:
-        Jx, Jf, Jk = integrator.linearize(scene, trajectory)
+    Jx, Jf, Jk, Jr = integrator.linearize(scene, trajectory, ramps=ramps)
+    ramp = Jr @ scene.transmission if ramps else None
     q, v = trajectory.q, trajectory.v
     if ramp is not None and scene.inputs:
         # Only the end of a step counts.
@@ -361,10 +360,9 @@ def _in_velocity(scene: Scene, q: Floats, fields: Fields, inverse: Floats) -> tu
 def _drift_derivatives(
     scene: Scene, trajectory: Trajectory, start: Floats, *, variational: bool
 ) -> tuple[Floats, Floats, Floats]:
-    """Derivatives of the drift in (q, p), or (q, v), (N, n, 2n) and in u (N, n, m), by differences of eighth order.
+    """Derivatives of the drift in the state (N, n, 2n), in u (N, n, m) and in a ramp of u, by differences.
 
-    The last ones (N, n, m) are those in a change of the control that grows linearly from 0 over the step. Differences,
-    as the drift alone needs second derivatives of diffusion fields, which noise classes do not provide.
+    The drift alone needs second derivatives of diffusion fields, which noise classes do not provide.
     """
     n, m, linear = scene.robot.dof, scene.controls, trajectory.u_nodes.shape[1] > 0
     found = np.zeros((trajectory.steps, n, 2 * (n + m)))
@@ -394,7 +392,27 @@ def _matching(scene: Scene, trajectory: Trajectory, given: Integrator | None) ->
     require_motion(scene, trajectory)
     integrator = _integrator_of(scene, trajectory, given)
     require_scene_of(scene, trajectory)
+    if scene.custom is not None or "constraints.custom" in scene.values or not trajectory.scene_values:
+        _require_first_step(scene, trajectory, integrator)
     return integrator
+
+
+def _require_first_step(scene: Scene, trajectory: Trajectory, integrator: Integrator) -> None:
+    """Refuse a motion whose first step, if it is undivided, is another one in a scene with functions of one's own."""
+    if not trajectory.steps or trajectory.statistics.substeps[0] > 1:
+        return
+    first = trajectory.part(0, 1)
+    commands = open_loop(first.u)._replace(within=first.u_stages if first.u_stages.shape[1] else first.u_stages[:0])
+    if first.u_nodes.shape[1]:
+        commands = open_line(first.u_nodes, integrator.stage_times)
+    state, _ = integrator.start(scene, first.q[:1].copy(), first.v[:1].copy())
+    drawn = first.dw[None] if trajectory.noisy else first.dw[None, :0][:0]
+    (again,) = integrator.rollout(scene, state, commands, drawn, first.dt)
+    if (
+        again.failure is not None
+        or np.abs(again.v[0] - first.v[1]).max() > _SAME * np.abs(np.diff(first.v, axis=0)).max()
+    ):
+        raise InputError("the trajectory was made in another scene than the one given: its first step differs")
 
 
 def _integrator_of(scene: Scene, trajectory: Trajectory, given: Integrator | None) -> Integrator:
@@ -402,26 +420,22 @@ def _integrator_of(scene: Scene, trajectory: Trajectory, given: Integrator | Non
     linear = trajectory.u_nodes.shape[1] > 0
     if trajectory.dw.shape[1] not in (scene.processes, scene.increments(linear=linear)):
         raise InputError(f"the trajectory has {trajectory.dw.shape[1]} processes, the scene {scene.processes}")
-    made: Integrator | None = None
-    problem = ""
+    if given is not None and not isinstance(given, Integrator):
+        raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {given!r}")
+    if given is not None and str(given) == trajectory.integrator:
+        return given
     try:
         made = integrator_of(trajectory.integrator)
-    except InputError as error:
-        problem = str(error)
-    if given is None:
-        if made is None:
-            raise InputError(
-                f"the trajectory was made with {trajectory.integrator}, which cannot be made again ({problem}): "
-                "give integrator="
-            )
-        return made
-    if not isinstance(given, Integrator):
-        raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {given!r}")
-    if str(given) != trajectory.integrator and (made is None or not given.same_map(made)):
+    except InputError as problem:
+        raise InputError(
+            f"the trajectory was made with {trajectory.integrator}, which cannot be made again ({problem}): "
+            "give integrator="
+        ) from None
+    if given is not None and not given.same_map(made):
         raise InputError(
             f"the trajectory was made with {trajectory.integrator}, not {given}: leave integrator out, or give that one"
         )
-    return given
+    return given or made
 
 
 @dataclass(frozen=True, eq=False)

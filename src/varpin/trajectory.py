@@ -418,11 +418,7 @@ class Trajectory(Frozen):
 
     @classmethod
     def of_members(cls, source: Path, members: Mapping[str, Any], robot: Robot | None, prefix: str = "") -> Trajectory:
-        """The trajectory from the entries of the file ``source`` whose names begin with ``prefix``.
-
-        Raises:
-            FileError: As for :meth:`load`.
-        """
+        """The trajectory from the entries of the file ``source`` that begin with ``prefix``; errors as :meth:`load`."""
         found = record_of(cls, members, source, prefix=prefix)
         _require_scene_values(source, found.scene_values, len(found.joint_names))
         # Energies and momenta overflow before q and v do; they may then be infinite.

@@ -106,13 +106,13 @@ bool allocates_nothing(const varpin::Mechanism& mechanism) {
 
     varpin::ExplicitRollout runge_kutta(mechanism, varpin::ExplicitMethod::runge_kutta, 1, q0, v0);
     right &= without_allocation("Runge and Kutta", [&] {
-        runge_kutta.roll(h, commands, nullptr, nullptr, nullptr, nodes);
+        runge_kutta.roll(h, commands, {}, nodes);
         return done == N;
     });
 
     const std::vector<double> impulses(2 * N * n, 1e-3);
     right &= without_allocation("Runge and Kutta under impulses", [&] {
-        runge_kutta.roll(h, commands, nullptr, nullptr, impulses.data(), nodes);
+        runge_kutta.roll(h, commands, {.impulses = impulses.data()}, nodes);
         return done == N;
     });
 
@@ -120,13 +120,13 @@ bool allocates_nothing(const varpin::Mechanism& mechanism) {
     std::vector<varpin::PathState> paths(1, varpin::PathState(mechanism, midpoint.stages));
     right &= without_allocation("midpoint steps", [&] {
         if (!stepper.begin(q0, v0, paths[0])) return false;
-        stepper.roll(h, commands, nullptr, nullptr, nullptr, paths, nodes);
+        stepper.roll(h, commands, {}, paths, nodes);
         return done == N;
     });
 
     right &= without_allocation("midpoint steps under impulses", [&] {
         if (!stepper.begin(q0, v0, paths[0])) return false;
-        stepper.roll(h, commands, nullptr, nullptr, impulses.data(), paths, nodes);
+        stepper.roll(h, commands, {.impulses = impulses.data()}, paths, nodes);
         return done == N;
     });
 

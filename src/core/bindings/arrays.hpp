@@ -50,11 +50,19 @@ bool given(const Array& array, const char* name, std::initializer_list<std::size
     return true;
 }
 
-// A NumPy array to be filled in.
-inline Out array_for(double*& values, std::initializer_list<std::size_t> shape) {
+// The same of several arrays of one shape, names and arrays in turn.
+inline void require_each(std::initializer_list<std::size_t>) {}
+template <class Array, class... More>
+void require_each(std::initializer_list<std::size_t> shape, const char* name, const Array& array, const More&... more) {
+    require(array, name, shape);
+    require_each(shape, more...);
+}
+
+// A NumPy array of zeros, to be filled in.
+inline Out array_for(std::initializer_list<std::size_t> shape) {
     std::size_t size = 1;
     for (std::size_t length : shape) size *= length;
-    values = new double[size]();
+    auto* values = new double[size]();
     nb::capsule owner(values, [](void* held) noexcept { delete[] static_cast<double*>(held); });
     return Out(values, shape, owner);
 }
@@ -74,9 +82,8 @@ inline BytesOut array_of(const std::vector<std::uint8_t>& bytes) {
 
 // A NumPy array that owns a copy of some numbers.
 inline Out array_of(const double* values, std::initializer_list<std::size_t> shape) {
-    double* copy = nullptr;
-    Out out = array_for(copy, shape);
-    std::copy(values, values + out.size(), copy);
+    Out out = array_for(shape);
+    std::copy(values, values + out.size(), out.data());
     return out;
 }
 

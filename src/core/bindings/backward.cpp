@@ -147,8 +147,8 @@ std::ptrdiff_t run_on_roots(RootPass& pass, double h, int hold, double regulariz
     return pass.run(h, hold, regularization, given.steps, costs, gains);
 }
 
-// The changes of the controls, moves (R, m), and the states after each step, after (N, 2n), of a linearized motion under
-// a plan. True where a control reaches a limit.
+// The changes of the controls, moves (R, m), and the states after each step, after (N, 2n), of a linearized motion
+// under a plan. True where a control reaches a limit.
 bool foresee(int hold, In<3> A, In<3> B, In<2> feedforward, In<3> feedback, In<3> slack, InOut<2> moves,
              InOut<2> after) {
     const std::size_t N = A.shape(0), x = A.shape(1), m = B.shape(2), R = decisions_of(N, hold);

@@ -32,9 +32,8 @@ inline std::vector<Body> jointed_bodies(const Integers<1>& parent, const Integer
                                         const In<2>& translation, const Integers<1>& coordinate, const In<1>& ratio,
                                         const In<1>& offset, std::size_t n) {
     const std::size_t bodies = parent.shape(0);
-    for (const auto& [array, name] : {std::pair{&prismatic, "prismatic"}, {&coordinate, "coordinate"}})
-        require(*array, name, {bodies});
-    for (const auto& [array, name] : {std::pair{&ratio, "ratio"}, {&offset, "offset"}}) require(*array, name, {bodies});
+    require_each({bodies}, "prismatic", prismatic, "coordinate", coordinate);
+    require_each({bodies}, "ratio", ratio, "offset", offset);
     require(rotation, "rotation", {bodies, 3, 3});
     require(translation, "translation", {bodies, 3});
     std::vector<Body> out(bodies);

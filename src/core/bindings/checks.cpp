@@ -1,10 +1,9 @@
 // The error of a finished motion.
-#include "varpin/clearance.hpp"
-
 #include <utility>
 
 #include "arrays.hpp"
 #include "registrations.hpp"
+#include "varpin/clearance.hpp"
 
 namespace varpin::border {
 
@@ -25,12 +24,11 @@ Stretch stretch_of(In<3> curves, In<3> sums, In<2> places) {
 }
 
 Out propagated_errors(const Mechanism& mechanism, In<2> q, In<2> v, In<2> u, In<3> within, double dt,
-                      const Stretch& narrow, const Stretch* wide, bool damped, In<1> most_q,
-                      In<1> most_v) {
+                      const Stretch& narrow, const Stretch* wide, bool damped, In<1> most_q, In<1> most_v) {
     const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
     const std::size_t steps = u.shape(0), stages = within.shape(1);
-    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}}) require(*array, name, {steps + 1, n});
-    for (const auto& [array, name] : {std::pair{&most_q, "most_q"}, {&most_v, "most_v"}}) require(*array, name, {n});
+    require_each({steps + 1, n}, "q", q, "v", v);
+    require_each({n}, "most_q", most_q, "most_v", most_v);
     require(u, "u", {steps, m});
     require(within, "within", {steps, stages, m});
     if (!(dt > 0.0)) throw std::invalid_argument("dt must be positive");

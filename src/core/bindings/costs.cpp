@@ -72,7 +72,7 @@ void add_term(CostTerms& costs, Subject subject, int index, In<2> weight, In<2> 
 
 std::size_t rows_of(const CostTerms& costs, const In<2>& q, const In<2>& v, const In<2>& u) {
     const std::size_t rows = q.shape(0), n = static_cast<std::size_t>(costs.dof);
-    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}}) require(*array, name, {rows, n});
+    require_each({rows, n}, "q", q, "v", v);
     require(u, "u", {rows, static_cast<std::size_t>(costs.controls)});
     return rows;
 }
@@ -80,12 +80,11 @@ std::size_t rows_of(const CostTerms& costs, const In<2>& q, const In<2>& v, cons
 // Values (N, terms) at rows of q, v and u.
 Out values(const CostTerms& costs, In<2> q, In<2> v, In<2> u) {
     const std::size_t rows = rows_of(costs, q, v, u), count = costs.terms.size();
-    double* found = nullptr;
-    const Out out = array_for(found, {rows, count});
+    const Out out = array_for({rows, count});
     nb::gil_scoped_release release;
     CostSample sample(costs);
     for (std::size_t s = 0; s < rows; ++s)
-        sample.values(&q(s, 0), &v(s, 0), u.data() + s * u.shape(1), s, found + s * count);
+        sample.values(&q(s, 0), &v(s, 0), u.data() + s * u.shape(1), s, out.data() + s * count);
     return out;
 }
 
@@ -93,15 +92,14 @@ Out values(const CostTerms& costs, In<2> q, In<2> v, In<2> u) {
 std::tuple<Out, Out> expand(const CostTerms& costs, In<2> q, In<2> v, In<2> u) {
     const std::size_t rows = rows_of(costs, q, v, u), size = static_cast<std::size_t>(costs.size());
     const std::size_t matrices = costs.linear() ? 1 : rows;
-    double *g = nullptr, *H = nullptr;
-    const Out gradient = array_for(g, {rows, size}), hessian = array_for(H, {matrices, size, size});
+    const Out gradient = array_for({rows, size}), hessian = array_for({matrices, size, size});
     {
         nb::gil_scoped_release release;
         CostSample sample(costs);
-        for (std::size_t s = 0; s < matrices; ++s) sample.add_constant_hessian(H + s * size * size);
+        for (std::size_t s = 0; s < matrices; ++s) sample.add_constant_hessian(hessian.data() + s * size * size);
         for (std::size_t s = 0; s < rows; ++s) {
-            double* hessian = H + (matrices > 1 ? s * size * size : 0);
-            sample.expand(&q(s, 0), &v(s, 0), u.data() + s * u.shape(1), s, g + s * size, hessian);
+            sample.expand(&q(s, 0), &v(s, 0), u.data() + s * u.shape(1), s, gradient.data() + s * size,
+                          hessian.data() + (matrices > 1 ? s * size * size : 0));
         }
     }
     return {gradient, hessian};

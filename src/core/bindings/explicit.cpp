@@ -46,8 +46,7 @@ struct BoundRollout {
 
 void require_rows(const Mechanism& mechanism, const In<2>& q, const In<2>& v, const In<2>& force) {
     const auto n = static_cast<std::size_t>(mechanism.dof());
-    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}, {&force, "force"}})
-        require(*array, name, {q.shape(0), n});
+    require_each({q.shape(0), n}, "q", q, "v", v, "force", force);
 }
 
 // The rate (v, a) of x = (q, v) under a force, and whether the mass matrix is positive definite.
@@ -55,11 +54,10 @@ std::tuple<Out, bool> rate(BoundDynamics& dynamics, In<1> x, In<1> force) {
     const auto n = static_cast<std::size_t>(dynamics.core.dof());
     require(x, "x", {2 * n});
     require(force, "force", {n});
-    double* values = nullptr;
-    const Out out = array_for(values, {2 * n});
+    const Out out = array_for({2 * n});
     const bool regular = dynamics.core.at(x.data(), x.data() + n);
-    std::copy(x.data() + n, x.data() + 2 * n, values);
-    dynamics.core.acceleration(force.data(), values + n);
+    std::copy(x.data() + n, x.data() + 2 * n, out.data());
+    dynamics.core.acceleration(force.data(), out.data() + n);
     return {out, regular};
 }
 
@@ -67,10 +65,9 @@ std::tuple<Out, bool> rate(BoundDynamics& dynamics, In<1> x, In<1> force) {
 std::tuple<Out, double, bool> node(BoundDynamics& dynamics, In<1> x) {
     const auto n = static_cast<std::size_t>(dynamics.core.dof());
     require(x, "x", {2 * n});
-    double* p = nullptr;
-    const Out momentum = array_for(p, {n});
+    const Out momentum = array_for({n});
     const bool regular = dynamics.core.at(x.data(), x.data() + n);
-    const double energy = dynamics.core.energy(x.data() + n, p);
+    const double energy = dynamics.core.energy(x.data() + n, momentum.data());
     return {momentum, energy, regular};
 }
 
@@ -79,17 +76,16 @@ std::tuple<Out, double, bool> node(BoundDynamics& dynamics, In<1> x) {
 std::tuple<Out, Out, Out, Out, std::size_t> accelerations(const Mechanism& mechanism, In<2> q, In<2> v, In<2> force) {
     require_rows(mechanism, q, v, force);
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
-    double *a = nullptr, *in_q = nullptr, *in_v = nullptr, *in_force = nullptr;
-    const Out values = array_for(a, {rows, n}), aq = array_for(in_q, {rows, n, n}), av = array_for(in_v, {rows, n, n}),
-              af = array_for(in_force, {rows, n, n});
+    const Out values = array_for({rows, n}), aq = array_for({rows, n, n}), av = array_for({rows, n, n}),
+              af = array_for({rows, n, n});
     std::size_t s = 0;
     {
         nb::gil_scoped_release release;
         ForwardDynamics dynamics(mechanism, true);
         for (; s < rows && dynamics.at(q.data() + s * n, v.data() + s * n); ++s) {
-            dynamics.acceleration(force.data() + s * n, a + s * n);
-            dynamics.differentiate(v.data() + s * n, a + s * n);
-            dynamics.derivatives(in_q + s * n * n, in_v + s * n * n, in_force + s * n * n);
+            dynamics.acceleration(force.data() + s * n, values.data() + s * n);
+            dynamics.differentiate(v.data() + s * n, values.data() + s * n);
+            dynamics.derivatives(aq.data() + s * n * n, av.data() + s * n * n, af.data() + s * n * n);
         }
     }
     return {values, aq, av, af, s};
@@ -99,15 +95,12 @@ std::tuple<Out, Out, Out, Out, std::size_t> accelerations(const Mechanism& mecha
 // potential.
 Out inverse_dynamics(const Mechanism& mechanism, In<2> q, In<2> v, In<2> a) {
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
-    require(q, "q", {rows, n});
-    require(v, "v", {rows, n});
-    require(a, "a", {rows, n});
-    double* force = nullptr;
-    const Out out = array_for(force, {rows, n});
+    require_each({rows, n}, "q", q, "v", v, "a", a);
+    const Out out = array_for({rows, n});
     nb::gil_scoped_release release;
     ForwardDynamics dynamics(mechanism, true);
     for (std::size_t s = 0; s < rows; ++s)
-        dynamics.inverse(q.data() + s * n, v.data() + s * n, a.data() + s * n, force + s * n);
+        dynamics.inverse(q.data() + s * n, v.data() + s * n, a.data() + s * n, out.data() + s * n);
     return out;
 }
 
@@ -120,12 +113,10 @@ std::tuple<Out, Out, std::size_t> linearize(const Mechanism& mechanism, Explicit
     ExplicitStepper stepper(mechanism, method, true);
     stepper.ramp = ramp;
     const std::size_t abscissae = force.shape(1);
-    require(q, "q", {rows, n});
-    require(v, "v", {rows, n});
+    require_each({rows, n}, "q", q, "v", v);
     if (abscissae != 1) require(force, "force", {rows, static_cast<std::size_t>(stepper.abscissae()), n});
     require(force, "force", {rows, abscissae, n});
-    double *in_x = nullptr, *in_force = nullptr;
-    const Out Jx = array_for(in_x, {rows, 2 * n, 2 * n}), Jf = array_for(in_force, {rows, 2 * n, n});
+    const Out Jx = array_for({rows, 2 * n, 2 * n}), Jf = array_for({rows, 2 * n, n});
     std::size_t s = 0;
     {
         nb::gil_scoped_release release;
@@ -134,7 +125,7 @@ std::tuple<Out, Out, std::size_t> linearize(const Mechanism& mechanism, Explicit
             std::copy_n(v.data() + s * n, n, stepper.v.data());
             if (!stepper.dynamics.at(q.data() + s * n, v.data() + s * n)) break;
             if (!stepper.step(dt, force.data() + s * abscissae * n, abscissae > 1 ? static_cast<int>(n) : 0)) break;
-            stepper.write_derivatives(dt, in_x + s * 4 * n * n, in_force + s * 2 * n * n);
+            stepper.write_derivatives(dt, Jx.data() + s * 4 * n * n, Jf.data() + s * 2 * n * n);
         }
     }
     return {Jx, Jf, s};
@@ -142,8 +133,7 @@ std::tuple<Out, Out, std::size_t> linearize(const Mechanism& mechanism, Explicit
 
 BoundRollout rollout(SharedMechanism mechanism, ExplicitMethod method, In<2> q, In<2> v) {
     const std::size_t n = static_cast<std::size_t>(mechanism->dof()), paths = q.shape(0);
-    require(q, "q", {paths, n});
-    require(v, "v", {paths, n});
+    require_each({paths, n}, "q", q, "v", v);
     return BoundRollout(std::move(mechanism), method, q, v);
 }
 
@@ -157,11 +147,9 @@ bool first_nodes(BoundRollout& rollout, nb::handle nodes) {
 void roll(BoundRollout& rollout, double dt, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes,
           const std::optional<In<4>>& impulses) {
     ExplicitRollout& core = rollout.core;
-    const double* kicks = impulses_of(*rollout.mechanism, impulses, nodes);
     roll_paths(*rollout.mechanism, static_cast<std::size_t>(core.paths()), core.abscissae(), commands, increments,
-               drift, nodes, [&](const Commands& by, const double* dw, const double* more, const Nodes& to) {
-                   core.roll(dt, by, dw, more, kicks, to);
-               });
+               drift, impulses, nodes,
+               [&](const Commands& by, const Additions& more, const Nodes& to) { core.roll(dt, by, more, to); });
 }
 
 }  // namespace

@@ -39,9 +39,8 @@ std::tuple<Out, Out, Out> place_frame(const Links& links, In<2> turned, In<1> sh
     require(shifted, "shifted", {3});
     require(q, "q", {rows, n});
     if (count == 0) throw std::invalid_argument("a frame needs at least one body");
-    double *R = nullptr, *p = nullptr, *J = nullptr;
-    const Out rotation = array_for(R, {rows, 3, 3}), position = array_for(p, {rows, 3}),
-              jacobians = array_for(J, {jacobian ? rows : 0, 6, n});
+    const Out rotation = array_for({rows, 3, 3}), position = array_for({rows, 3}),
+              jacobians = array_for({jacobian ? rows : 0, 6, n});
     {
         nb::gil_scoped_release release;
         const Placement offset{rotation_at(turned.data()), {shifted(0), shifted(1), shifted(2)}};
@@ -49,9 +48,9 @@ std::tuple<Out, Out, Out> place_frame(const Links& links, In<2> turned, In<1> sh
         for (std::size_t s = 0; s < rows; ++s) {
             forward_kinematics(links, q.data() + s * n, at.data());
             const Placement frame = at.back() * offset;
-            write(frame.rotation, R + 9 * s);
-            write(frame.position, p + 3 * s);
-            if (jacobian) frame_jacobian(links, at.data(), frame.position, J + 6 * n * s);
+            write(frame.rotation, rotation.data() + 9 * s);
+            write(frame.position, position.data() + 3 * s);
+            if (jacobian) frame_jacobian(links, at.data(), frame.position, jacobians.data() + 6 * n * s);
         }
     }
     return {rotation, position, jacobians};

@@ -283,7 +283,7 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
     require(center, "center", {bodies, 3});
     require(inertia, "inertia", {bodies, 6});
     require(carried, "carried", {loads.shape(0), n});
-    for (const auto& [array, name] : {std::pair{&group, "group"}, {&periodic, "periodic"}}) require(*array, name, {n});
+    require_each({n}, "group", group, "periodic", periodic);
     require(gravity, "gravity", {3});
     require(actuation, "actuation", {n, m});
     require(constant, "constant", {n, processes});
@@ -324,8 +324,7 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
 // L, L_q, L_v, L_qq, L_vq, L_vv.
 std::tuple<double, Out, Out, Out, Out, Out> jet(const Mechanism& mechanism, In<1> q, In<1> v) {
     const auto n = static_cast<std::size_t>(mechanism.dof());
-    require(q, "q", {n});
-    require(v, "v", {n});
+    require_each({n}, "q", q, "v", v);
     Jet<double> w(mechanism.tree);
     lagrangian_jet(mechanism, q.data(), v.data(), w);
     return {w.kinetic - w.total_potential(), array_of(w.Lq.data(), {n}),   array_of(w.Lv.data(), {n}),
@@ -335,17 +334,15 @@ std::tuple<double, Out, Out, Out, Out, Out> jet(const Mechanism& mechanism, In<1
 // M and L_vq at each row of q and v (N, n).
 std::tuple<Out, Out> jets(const Mechanism& mechanism, In<2> q, In<2> v) {
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
-    require(q, "q", {rows, n});
-    require(v, "v", {rows, n});
-    double *M = nullptr, *A = nullptr;
-    Out Ms = array_for(M, {rows, n, n}), As = array_for(A, {rows, n, n});
+    require_each({rows, n}, "q", q, "v", v);
+    Out Ms = array_for({rows, n, n}), As = array_for({rows, n, n});
     {
         nb::gil_scoped_release release;
         Jet<double> w(mechanism.tree);
         for (std::size_t s = 0; s < rows; ++s) {
             momentum_slopes(mechanism, q.data() + s * n, v.data() + s * n, w);
-            std::copy(w.M.begin(), w.M.end(), M + s * n * n);
-            std::copy(w.A.begin(), w.A.end(), A + s * n * n);
+            std::copy(w.M.begin(), w.M.end(), Ms.data() + s * n * n);
+            std::copy(w.A.begin(), w.A.end(), As.data() + s * n * n);
         }
     }
     return {Ms, As};
@@ -354,12 +351,10 @@ std::tuple<Out, Out> jets(const Mechanism& mechanism, In<2> q, In<2> v) {
 // The derivative of v in (q, p) (N, n, 2n) at each row of q and v (N, n). NaN where M is not positive definite.
 Out velocity_slopes_at(const Mechanism& mechanism, In<2> q, In<2> v) {
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
-    require(q, "q", {rows, n});
-    require(v, "v", {rows, n});
-    double* slopes = nullptr;
-    const Out out = array_for(slopes, {rows, n, 2 * n});
+    require_each({rows, n}, "q", q, "v", v);
+    const Out out = array_for({rows, n, 2 * n});
     nb::gil_scoped_release release;
-    kernels_of(mechanism).velocity_slopes(mechanism, rows, q.data(), v.data(), slopes);
+    kernels_of(mechanism).velocity_slopes(mechanism, rows, q.data(), v.data(), out.data());
     return out;
 }
 
@@ -367,12 +362,9 @@ Out velocity_slopes_at(const Mechanism& mechanism, In<2> q, In<2> v) {
 // dF/dv of the elements, and the dissipated power.
 std::tuple<Out, Out, Out, Out> forces(const Mechanism& mechanism, In<2> q, In<2> v, In<2> f) {
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
-    require(q, "q", {rows, n});
-    require(v, "v", {rows, n});
-    require(f, "f", {rows, n});
-    double* of[4] = {};
-    const Out value = array_for(of[0], {rows, n}), by_q = array_for(of[1], {rows, n}),
-              by_v = array_for(of[2], {rows, n}), lost = array_for(of[3], {rows, n});
+    require_each({rows, n}, "q", q, "v", v, "f", f);
+    const std::array<Out, 4> found{array_for({rows, n}), array_for({rows, n}), array_for({rows, n}),
+                                   array_for({rows, n})};
     std::vector<JointForce<double>> sum(n);
     CouplingWorkspace<double> workspace;
     for (std::size_t s = 0; s < rows; ++s) {
@@ -381,26 +373,24 @@ std::tuple<Out, Out, Out, Out> forces(const Mechanism& mechanism, In<2> q, In<2>
         for (std::size_t c = 0; c < n; ++c) {
             const JointForce<double>& force = sum[c];
             for (int i = 0; i < 4; ++i)
-                of[i][s * n + c] = std::array{force.value, force.by_q, force.by_v, force.lost}[i];
+                found[i].data()[s * n + c] = std::array{force.value, force.by_q, force.by_v, force.lost}[i];
         }
     }
-    return {value, by_q, by_v, lost};
+    return {found[0], found[1], found[2], found[3]};
 }
 
 // At each row of q and v (N, n): the forces of couplings besides L_q, and dF/dq and dF/dv (N, n, n).
 std::tuple<Out, Out, Out> coupled_forces(const Mechanism& mechanism, In<2> q, In<2> v) {
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
-    require(q, "q", {rows, n});
-    require(v, "v", {rows, n});
-    double *value = nullptr, *by_q = nullptr, *by_v = nullptr;
-    const Out F = array_for(value, {rows, n}), Fq = array_for(by_q, {rows, n, n}), Fv = array_for(by_v, {rows, n, n});
+    require_each({rows, n}, "q", q, "v", v);
+    const Out F = array_for({rows, n}), Fq = array_for({rows, n, n}), Fv = array_for({rows, n, n});
     std::vector<JointForce<double>> sum(n);
     CouplingWorkspace<double> workspace;
     for (std::size_t s = 0; s < rows; ++s) {
         std::fill(sum.begin(), sum.end(), JointForce<double>{});
         mechanism.couplings.add_forces(static_cast<int>(n), q.data() + s * n, v.data() + s * n, workspace, sum.data(),
-                                       by_q + s * n * n, by_v + s * n * n);
-        for (std::size_t c = 0; c < n; ++c) value[s * n + c] = sum[c].value;
+                                       Fq.data() + s * n * n, Fv.data() + s * n * n);
+        for (std::size_t c = 0; c < n; ++c) F.data()[s * n + c] = sum[c].value;
     }
     return {F, Fq, Fv};
 }
@@ -408,25 +398,22 @@ std::tuple<Out, Out, Out> coupled_forces(const Mechanism& mechanism, In<2> q, In
 // Derivatives of M, L_vq and L_qq along (alpha, beta) at each row of q, v, alpha and beta (N, n).
 std::tuple<Out, Out, Out> jets_along(const Mechanism& mechanism, In<2> q, In<2> v, In<2> alpha, In<2> beta) {
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
-    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}, {&alpha, "alpha"}, {&beta, "beta"}})
-        require(*array, name, {rows, n});
-    double* slopes[3] = {};
-    const Out M = array_for(slopes[0], {rows, n, n}), A = array_for(slopes[1], {rows, n, n}),
-              Lqq = array_for(slopes[2], {rows, n, n});
+    require_each({rows, n}, "q", q, "v", v, "alpha", alpha, "beta", beta);
+    const Out M = array_for({rows, n, n}), A = array_for({rows, n, n}), Lqq = array_for({rows, n, n});
     {
         nb::gil_scoped_release release;
         Jet<Dual> w(mechanism.tree);
         std::vector<Dual> at_q(n), at_v(n);
-        const std::vector<Dual>* of[3] = {&w.M, &w.A, &w.Lqq};
         for (std::size_t s = 0; s < rows; ++s) {
             for (std::size_t c = 0; c < n; ++c) {
                 at_q[c] = {q(s, c), alpha(s, c)};
                 at_v[c] = {v(s, c), beta(s, c)};
             }
             lagrangian_jet(mechanism, at_q.data(), at_v.data(), w);
-            for (int i = 0; i < 3; ++i) {
-                std::transform(of[i]->begin(), of[i]->end(), slopes[i] + s * n * n,
-                               [](const Dual& x) { return x.slope; });
+            for (std::size_t i = 0; i < n * n; ++i) {
+                M.data()[s * n * n + i] = w.M[i].slope;
+                A.data()[s * n * n + i] = w.A[i].slope;
+                Lqq.data()[s * n * n + i] = w.Lqq[i].slope;
             }
         }
     }
@@ -438,14 +425,13 @@ std::tuple<Out, Out, Out> constraints(const Mechanism& mechanism, In<2> q) {
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
     const std::size_t m = static_cast<std::size_t>(mechanism.constraints.rows());
     require(q, "q", {rows, n});
-    double *g = nullptr, *scale = nullptr, *C = nullptr;
-    const Out G = array_for(g, {rows, m}), S = array_for(scale, {rows, m}), J = array_for(C, {rows, m, n});
+    const Out G = array_for({rows, m}), S = array_for({rows, m}), J = array_for({rows, m, n});
     ConstraintJet w;
     for (std::size_t s = 0; s < rows; ++s) {
         mechanism.constraints.at(q.data() + s * n, w);
-        std::copy(w.g.begin(), w.g.end(), g + s * m);
-        std::copy(w.scale.begin(), w.scale.end(), scale + s * m);
-        std::copy(w.C.begin(), w.C.end(), C + s * m * n);
+        std::copy(w.g.begin(), w.g.end(), G.data() + s * m);
+        std::copy(w.scale.begin(), w.scale.end(), S.data() + s * m);
+        std::copy(w.C.begin(), w.C.end(), J.data() + s * m * n);
     }
     return {G, S, J};
 }
@@ -454,15 +440,13 @@ std::tuple<Out, Out, Out> constraints(const Mechanism& mechanism, In<2> q) {
 std::tuple<Out, Out> constraint_curvature(const Mechanism& mechanism, In<1> q, In<1> weights, In<1> v) {
     const std::size_t n = static_cast<std::size_t>(mechanism.dof());
     const std::size_t m = static_cast<std::size_t>(mechanism.constraints.rows());
-    require(q, "q", {n});
-    require(v, "v", {n});
+    require_each({n}, "q", q, "v", v);
     require(weights, "weights", {m});
-    double *H = nullptr, *bend = nullptr;
-    const Out curvature = array_for(H, {n, n}), bent = array_for(bend, {m, n});
+    const Out curvature = array_for({n, n}), bent = array_for({m, n});
     ConstraintJet w;
     mechanism.constraints.at(q.data(), w);
-    mechanism.constraints.add_curvature(weights.data(), 1.0, w, H);
-    mechanism.constraints.bend(v.data(), w, bend);
+    mechanism.constraints.add_curvature(weights.data(), 1.0, w, curvature.data());
+    mechanism.constraints.bend(v.data(), w, bent.data());
     return {curvature, bent};
 }
 

@@ -39,12 +39,12 @@ class NodeArrays {
           done(field<IntegersInOut<1>>(nodes, "done")) {
         const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
         const std::size_t P = paths(), N = steps();
-        for (const auto& [array, name] : {std::pair{&q, "q"}, {&p, "p"}, {&v, "v"}}) require(*array, name, {P, N, n});
+        require_each({P, N, n}, "q", q, "p", p, "v", v);
         require(energy, "energy", {P, N});
         require(u, "u", {P, N, m});
         require(tally, "tally", {P, N, 4});
         require(quality, "quality", {P, N, 3});
-        for (const auto& [array, name] : {std::pair{&ended, "ended"}, {&done, "done"}}) require(*array, name, {P});
+        require_each({P}, "ended", ended, "done", done);
     }
 
     std::size_t paths() const { return q.shape(0); }
@@ -145,43 +145,28 @@ class CommandArrays {
     bool linear = false;    // whether controls are linear over the steps of each decision
 };
 
-// Increments of Wiener processes (P, N, K), or null where there are none: (0, 0, k), or K = 0. There are as many for a
-// step as the commands see.
-inline const double* increments_of(const Mechanism& mechanism, const In<3>& increments, const NodeArrays& nodes,
-                                   const Commands& commands) {
-    const auto width = static_cast<std::size_t>(increments_of_step(mechanism, commands));
-    return given(increments, "increments", {nodes.paths(), nodes.steps(), width}) && width > 0 ? increments.data()
-                                                                                               : nullptr;
-}
-
-// A force in addition to the controls (P, N, n), or null for (0, 0, n).
-inline const double* drift_of(const Mechanism& mechanism, const In<3>& drift, const NodeArrays& nodes) {
-    const auto n = static_cast<std::size_t>(mechanism.dof());
-    return given(drift, "drift", {nodes.paths(), nodes.steps(), n}) ? drift.data() : nullptr;
-}
-
-// Impulses before and after each step of each path (P, N, 2, n), or null for none.
-inline const double* impulses_of(const Mechanism& mechanism, const std::optional<In<4>>& impulses, nb::handle nodes) {
-    if (!impulses) return nullptr;
-    const NodeArrays to(mechanism, nodes);
-    require(*impulses, "impulses", {to.paths(), to.steps(), 2, static_cast<std::size_t>(mechanism.dof())});
-    return impulses->data();
-}
-
-// Roll `paths` paths: calls move(commands, increments, drift, nodes) without the interpreter's lock, after all checks.
-// `stages` is the number of stages at which controls may change within a step.
+// Roll `paths` paths: calls move(commands, additions, nodes) without the interpreter's lock, after all checks. `stages`
+// is the number of stages at which controls may change within a step. Increments (P, N, K), for as many processes as
+// the commands see, and the drift (P, N, n) may be left out as (0, 0, .), impulses (P, N, 2, n) as None.
 template <class Move>
 void roll_paths(const Mechanism& mechanism, std::size_t paths, int stages, nb::handle commands, const In<3>& increments,
-                const In<3>& drift, nb::handle nodes, const Move& move) {
+                const In<3>& drift, const std::optional<In<4>>& impulses, nb::handle nodes, const Move& move) {
     const NodeArrays to(mechanism, nodes);
     to.require_paths(paths);
     const CommandArrays by(mechanism, commands, paths, to.steps(), stages);
     Commands view = by.view();
     view.sloped = view.stage_times && increments.shape(2) > static_cast<std::size_t>(mechanism.diffusion.processes);
-    const double* dw = increments_of(mechanism, increments, to, view);
-    const double* more = drift_of(mechanism, drift, to);
+    const auto n = static_cast<std::size_t>(mechanism.dof());
+    const auto width = static_cast<std::size_t>(increments_of_step(mechanism, view));
+    Additions more;
+    if (given(increments, "increments", {paths, to.steps(), width}) && width > 0) more.increments = increments.data();
+    if (given(drift, "drift", {paths, to.steps(), n})) more.drift = drift.data();
+    if (impulses) {
+        require(*impulses, "impulses", {paths, to.steps(), 2, n});
+        more.impulses = impulses->data();
+    }
     nb::gil_scoped_release release;
-    move(view, dw, more, to.view());
+    move(view, more, to.view());
 }
 
 }  // namespace varpin::border

@@ -30,8 +30,7 @@ Tableau tableau_of(In<2> a, In<2> gradient, In<2> force, In<1> b, In<1> c, In<2>
                    bool stiffly_accurate) {
     const std::size_t s = b.shape(0);
     if (s == 0) throw std::invalid_argument("a tableau must have at least one stage");
-    for (const auto& [array, name] : {std::pair{&a, "a"}, {&gradient, "gradient"}, {&force, "force"}})
-        require(*array, name, {s, s});
+    require_each({s, s}, "a", a, "gradient", gradient, "force", force);
     require(c, "c", {s});
     require(ahead, "ahead", {s, s + 1});
     return {static_cast<int>(s), copied(a), copied(gradient),
@@ -97,8 +96,7 @@ class Rollout {
     // Start each path at its row of q and v (P, n); false if an M(q) is not positive definite.
     bool begin(In<2> q, In<2> v) {
         const std::size_t n = size();
-        require(q, "q", {states_.size(), n});
-        require(v, "v", {states_.size(), n});
+        require_each({states_.size(), n}, "q", q, "v", v);
         const Turn stepper(*shared_);
         nb::gil_scoped_release release;
         for (std::size_t i = 0; i < states_.size(); ++i) {
@@ -122,26 +120,24 @@ class Rollout {
         const Turn stepper(*shared_);
         if (impulses && constrained_ && !stepper->held)
             throw std::invalid_argument("under constraints, impulses have to be held");
-        const double* kicks = impulses_of(*mechanism_, impulses, nodes);
-        roll_paths(*mechanism_, states_.size(), stages_, commands, increments, drift, nodes,
-                   [&](const Commands& by, const double* dw, const double* more, const Nodes& to) {
+        roll_paths(*mechanism_, states_.size(), stages_, commands, increments, drift, impulses, nodes,
+                   [&](const Commands& by, const Additions& more, const Nodes& to) {
                        stepper->guards = guards_;
-                       stepper->roll(h, by, dw, more, kicks, states_, to);
+                       stepper->roll(h, by, more, states_, to);
                    });
     }
 
     // Configurations, momenta, velocities (P, n) and energies (P).
     std::tuple<Out, Out, Out, Out> nodes() const {
         const std::size_t n = size(), P = states_.size();
-        double *q = nullptr, *p = nullptr, *v = nullptr, *energy = nullptr;
-        const Out Q = array_for(q, {P, n}), MV = array_for(p, {P, n}), V = array_for(v, {P, n});
-        const Out E = array_for(energy, {P});
+        const Out Q = array_for({P, n}), MV = array_for({P, n}), V = array_for({P, n});
+        const Out E = array_for({P});
         for (std::size_t i = 0; i < P; ++i) {
             const PathState& path = states_[i];
-            std::copy(path.q.begin(), path.q.end(), q + i * n);
-            std::copy(path.momentum.begin(), path.momentum.end(), p + i * n);
-            std::copy(path.v.begin(), path.v.end(), v + i * n);
-            energy[i] = path.energies.total();
+            std::copy(path.q.begin(), path.q.end(), Q.data() + i * n);
+            std::copy(path.momentum.begin(), path.momentum.end(), MV.data() + i * n);
+            std::copy(path.v.begin(), path.v.end(), V.data() + i * n);
+            E.data()[i] = path.energies.total();
         }
         return {Q, MV, V, E};
     }
@@ -192,13 +188,12 @@ std::tuple<Out, Out, Out, std::int64_t, std::size_t> derivatives(const StepsAt& 
 std::tuple<Out, std::int64_t, std::size_t> curvatures(const StepsAt& at, In<2> z) {
     const std::size_t N = at.N, n = at.n;
     require(z, "z", {N, 2 * n});
-    double* H = nullptr;
-    const Out found = array_for(H, {N, 3 * n, 3 * n});
+    const Out found = array_for({N, 3 * n, 3 * n});
     VariationalLinearization work = linearization(at);
     work.varies = at.varies;
     const auto [outcome, done] = at.each([&](std::size_t s) {
         return work.second(at.h, at.q(s), at.p(s), at.guess(s), at.force(s), at.halvings(s), z.data() + s * 2 * n,
-                           H + s * 9 * n * n, at.past(s));
+                           found.data() + s * 9 * n * n, at.past(s));
     });
     return {found, outcome, done};
 }
@@ -206,12 +201,11 @@ std::tuple<Out, std::int64_t, std::size_t> curvatures(const StepsAt& at, In<2> z
 // Configurations and velocities (N, n) at the end of each step.
 std::tuple<Out, Out, std::int64_t, std::size_t> ends(const StepsAt& at) {
     const std::size_t N = at.N, n = at.n;
-    double *q1 = nullptr, *v1 = nullptr;
-    const Out Q = array_for(q1, {N, n}), V = array_for(v1, {N, n});
+    const Out Q = array_for({N, n}), V = array_for({N, n});
     VariationalLinearization work = linearization(at);
     work.varies = at.varies;
     const auto [outcome, done] = at.each([&](std::size_t s) {
-        return work.end(at.h, at.q(s), at.p(s), at.force(s), at.halvings(s), q1 + s * n, v1 + s * n);
+        return work.end(at.h, at.q(s), at.p(s), at.force(s), at.halvings(s), Q.data() + s * n, V.data() + s * n);
     });
     return {Q, V, outcome, done};
 }

@@ -33,7 +33,7 @@ class StepsAt {
           halvings_(halvings),
           guess_(guess),
           place_(N + 1, 0) {
-        for (const auto& [array, name] : {std::pair{&q, "q"}, {&p, "p"}}) require(*array, name, {N, n});
+        require_each({N, n}, "q", q, "p", p);
         require(force, "force", {N, varies ? static_cast<std::size_t>(tableau.stages) : 1, n});
         require(substeps, "substeps", {N});
         require(guess, "guess", {N, static_cast<std::size_t>(tableau.stages), n});
@@ -90,11 +90,10 @@ class StepsAt {
     // and what `each` returns. first(step, Jx, Jf, Jr) writes the derivatives of one step.
     template <class First>
     std::tuple<Out, Out, Out, std::int64_t, std::size_t> derivatives(std::size_t more, const First& first) const {
-        double *Jx = nullptr, *Jf = nullptr, *Jr = nullptr;
-        const Out X = array_for(Jx, {N, 2 * n, 2 * n}), F = array_for(Jf, {N, 2 * n, n}),
-                  R = array_for(Jr, {N, 2 * n, more});
-        const auto [outcome, done] = each(
-            [&](std::size_t s) { return first(s, Jx + s * 4 * n * n, Jf + s * 2 * n * n, Jr + s * 2 * n * more); });
+        const Out X = array_for({N, 2 * n, 2 * n}), F = array_for({N, 2 * n, n}), R = array_for({N, 2 * n, more});
+        const auto [outcome, done] = each([&](std::size_t s) {
+            return first(s, X.data() + s * 4 * n * n, F.data() + s * 2 * n * n, R.data() + s * 2 * n * more);
+        });
         return {X, F, R, outcome, done};
     }
 

@@ -8,18 +8,24 @@ cubics through the steps instead, which take hardly any time.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from varpin.arrays import Floats, Integers, Mask
-from varpin.control.constraints import BoundBetween, BoundConstraint, BoundOnCubics, Horizon, PlanConstraint
-from varpin.control.parts import Parts
+from varpin.control.constraints import BoundConstraint, Horizon, PlanConstraint
 from varpin.control.problem import OptimalControlProblem
-from varpin.mechanics.scene import quiet
-from varpin.signals.commands import cubics
+from varpin.core.arrays import Commands
+from varpin.errors import LinearizationError
+from varpin.integrators import Integrator
+from varpin.integrators.base import Segment
+from varpin.linearization import linearize_steps, velocity_at_nodes
+from varpin.mechanics.custom import CustomForceError
+from varpin.mechanics.scene import Scene, quiet
+from varpin.signals.commands import Lines, cubics, on_lines, open_loop
+from varpin.simulation.record import trajectory_of
 from varpin.support.frozen import Frozen
-from varpin.trajectory import Trajectory
+from varpin.trajectory import Trajectory, joined
 
 # Parts of a step.
 _PARTS = 8
@@ -36,6 +42,258 @@ _NEAR = 1e-3
 _BETWEEN, _SHARE = 1e-6, 1e-3
 # Marks a row that is not enforced, in the place of its moment.
 _UNUSED = -1.0
+# Differences of states and controls, where the derivatives of a step's parts do not follow from each other.
+_SHIFT = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class Parts(Frozen):
+    """Steps of a scene without noise, each integrated in equal parts from the node at its begin.
+
+    Controls are (m,) of a step, or where they are linear those at its begin and its end (2m,).
+    """
+
+    scene: Scene
+    integrator: Integrator
+    dt: float  # of a part [s]
+    linear: bool
+
+    @classmethod
+    def of(cls, problem: OptimalControlProblem) -> Parts:
+        """Those of a problem's steps."""
+        return cls(quiet(problem.scene), problem.integrator, problem.dt / _PARTS, problem.linear)
+
+    def controls(self, u: Floats, steps: Integers) -> Floats:
+        """Controls (K, m), or (K, 2m), of steps, from those of all steps (N, m), or of all nodes (N + 1, m)."""
+        return np.concatenate([u[steps], u[steps + 1]], axis=1) if self.linear else u[steps]
+
+    def states(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats] | None:
+        """The q and v (K, parts + 1, n) at the ends of the parts of K steps from q and v (K, n); None if one fails."""
+        try:
+            found = self.integrator.motions(self.scene, q.copy(), v.copy(), self._commands(u), self.dt)
+        except CustomForceError:
+            return None
+        if found is None:
+            return None
+        return np.concatenate([q[:, None], found[0]], axis=1), np.concatenate([v[:, None], found[1]], axis=1)
+
+    def _commands(self, u: Floats) -> Commands:
+        """The controls of steps as one decision of each of K motions."""
+        m = self.scene.controls
+        found = open_loop(u[:, -m:])._replace(hold=_PARTS, own=1)
+        if not self.linear:
+            return found
+        times = np.array(self.integrator.stage_times or (0.5,))
+        return found._replace(before=np.ascontiguousarray(u[:, :m]), stage_times=times)
+
+    def slopes(self, q: Floats, v: Floats, u: Floats) -> tuple[tuple[Floats, Floats], Floats]:
+        """The states as :meth:`states`, and their derivatives (K, parts + 1, 2n, 2n + c) in (q, v, controls).
+
+        Raises:
+            LinearizationError: A part fails, or has no derivative.
+        """
+        if self.scene.inputs:
+            return self._states(q, v, u), self._by_differences(q, v, u)
+        motion, states = self._one_after_another(q, v, u)
+        return states, self._chained(motion, states, u)
+
+    def _states(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats]:
+        found = self.states(q, v, u)
+        if found is None:
+            raise LinearizationError(0, 0.0, "a step fails in parts")
+        return found
+
+    def _chained(self, motion: Trajectory, states: tuple[Floats, Floats], u: Floats) -> Floats:
+        """The derivatives in each step of :meth:`_one_after_another`, those of its parts one after another."""
+        scene, n, K = self.scene, self.scene.robot.dof, len(u)
+        lin = linearize_steps(scene, motion, self.integrator, motion.q[0], ramps=self.linear)
+        A, B = (array.reshape(K, _PARTS, *array.shape[1:]) for array in (lin.A, lin.B))
+        ramp = None if lin.ramp is None else lin.ramp.reshape(B.shape)
+        slopes = np.tile(np.eye(2 * n), (K, _PARTS + 1, 1, 1))
+        if self.integrator.variational:
+            at = velocity_at_nodes(scene, *(x.reshape(-1, n) for x in states))
+            slopes[:, :, n:] = at.reshape(K, _PARTS + 1, n, 2 * n)
+        found = np.empty((K, _PARTS + 1, 2 * n, 2 * n + u.shape[1]))
+        # In (x, controls).
+        after = np.tile(np.eye(2 * n, found.shape[3]), (K, 1, 1))
+        found[:, 0] = after
+        after[:, :, : 2 * n] = np.linalg.inv(slopes[:, 0])
+        for j in range(_PARTS):
+            after = A[:, j] @ after
+            if ramp is None:
+                after[:, :, 2 * n :] += B[:, j]
+            else:
+                share, m = j / _PARTS, scene.controls
+                rise = ramp[:, j] / _PARTS
+                after[:, :, 2 * n : 2 * n + m] += (1.0 - share) * B[:, j] - rise
+                after[:, :, 2 * n + m :] += share * B[:, j] + rise
+            found[:, j + 1] = slopes[:, j + 1] @ after
+        return found
+
+    def _by_differences(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """The derivatives by central differences: joints of kinematic inputs are on their way over a step."""
+        z, n = np.concatenate([q, v, u], axis=1), self.scene.robot.dof
+        K, Z = z.shape
+        shifts = _SHIFT * np.concatenate([np.eye(Z), -np.eye(Z)])
+        near = (z[:, None] + shifts).reshape(-1, Z)
+        states = np.concatenate(self._states(near[:, :n], near[:, n : 2 * n], near[:, 2 * n :]), axis=2)
+        after, before = states.reshape(K, 2, Z, _PARTS + 1, 2 * n).swapaxes(0, 1)
+        found: Floats = np.moveaxis((after - before) / (2.0 * _SHIFT), 1, -1)
+        return found
+
+    def _one_after_another(self, q: Floats, v: Floats, u: Floats) -> tuple[Trajectory, tuple[Floats, Floats]]:
+        """The parts of K steps as one motion, for its linearization, and their states (K, parts + 1, n).
+
+        In the place of each step's end is the begin of the next one: the linearization takes every step again from the
+        node at its begin; that at its end is a first guess only.
+        """
+        scene, integrator, dt, no_noise = self.scene, self.integrator, self.dt, self.scene.silence
+        state, first = integrator.start(scene, q.copy(), v.copy())
+        try:
+            segments = integrator.rollout_compiled(scene, state, self._commands(u), no_noise, scene.no_drift, dt)
+        except CustomForceError as error:
+            raise LinearizationError(0, 0.0, str(error)) from error
+        for segment in segments:
+            if segment.failure is not None:
+                raise LinearizationError(len(segment.q), dt * len(segment.q), "a step fails in parts")
+        ends: dict[str, Floats] = {}
+        states: dict[str, Floats] = {}
+        for name in ("q", "p", "v", "energy"):
+            begins = np.array([getattr(segment, name) for segment in first])
+            within = np.array([getattr(segment, name) for segment in segments])
+            states[name] = np.concatenate([begins, within], axis=1)
+            within[:-1, -1] = begins[1:, 0]
+            ends[name] = within.reshape(-1, *within.shape[2:])
+        impulses = [segment.impulses for segment in segments if segment.impulses is not None]
+        steps = Segment(
+            q=ends["q"],
+            p=ends["p"],
+            v=ends["v"],
+            energy=ends["energy"],
+            u=np.concatenate([segment.u for segment in segments]),
+            statistics=joined([segment.statistics for segment in segments]),
+            impulses=np.concatenate(impulses) if impulses else None,
+        )
+        motion = trajectory_of(scene, integrator, dt, first[0], [steps], None, None)
+        if self.linear:
+            mean, stages, nodes = self._lines(u)
+            motion = replace(motion, u=mean, u_stages=stages, u_nodes=nodes)
+        return motion, (states["q"], states["v"])
+
+    def _lines(self, u: Floats) -> Lines:
+        """The controls within the parts of K steps, one after another."""
+        begins, ends = np.split(np.repeat(u, _PARTS, axis=0), 2, axis=1)
+        before, mean = on_lines(begins, ends, _PARTS, (0.0, 0.5)).swapaxes(0, 1)
+        stages = on_lines(begins, ends, _PARTS, self.integrator.stage_times)
+        return Lines(mean.copy(), stages, np.concatenate([before, ends[-1:]]))
+
+
+@dataclass(frozen=True, eq=False)
+class BoundBetween(BoundConstraint):
+    """A constraint at instants within steps, each integrated in parts from the node at its begin.
+
+    The value at an instant is that of the parabola through the ends of parts next to it. The places are the nodes at
+    the ends of the steps; several instants may be in one step. The times are means of those of the rows.
+
+    Attributes:
+        of_nodes: The constraint at the nodes, all after the first.
+        parts: The steps in parts.
+        inner: The constraint, bound to a grid whose nodes after the first are the ends of parts of the K steps.
+        weights: The weights of these ends in each row (K, rows, parts + 1); all zero in rows that are not enforced.
+    """
+
+    of_nodes: BoundConstraint
+    parts: Parts
+    inner: BoundConstraint
+    weights: Floats
+
+    @property
+    def in_force(self) -> Mask:
+        """Which rows are enforced (K, rows); others have minus the scale for a value."""
+        return np.asarray(self.weights.any(axis=2))
+
+    @property
+    def begins(self) -> Integers:
+        """Indices of the nodes at the begin of the steps (K,)."""
+        return self.places - 1
+
+    def _within(self, q: Floats, v: Floats, u: Floats) -> tuple[tuple[Floats, Floats, Floats], Integers]:
+        """q, v and controls of the steps, each once, and which of them each instant is in (K,)."""
+        steps, index = np.unique(self.begins, return_inverse=True)
+        return (q[steps], v[steps], self.parts.controls(u, steps)), index
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """See :meth:`BoundConstraint.value`; for one motion. Infinite where a step fails in parts."""
+        given, index = self._within(q, v, u)
+        within = self.parts.states(*given)
+        if within is None:
+            return np.full(self.shape, np.inf)
+        q, v = (_after_first(x[index]) for x in within)
+        c = self.inner.value(q, v, u)
+        found = np.einsum("krs,ksr->kr", self.weights, c.reshape(len(self.places), -1, len(self.rows)))
+        return np.where(self.in_force, found, -self.scale)
+
+    def jacobian(self, q: Floats, v: Floats) -> Floats:
+        """dc/d(q, v) (K, rows, 2n) as at the ends of the steps."""
+        return self.of_nodes.jacobian(q, v)[self.begins]
+
+    def slopes(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """Derivatives (K, rows, 2n + c) in the states where the steps begin and in their controls (K, c).
+
+        Raises:
+            LinearizationError: A part of a step has no derivative.
+        """
+        given, index = self._within(q, v, u)
+        states, D = self.parts.slopes(*given)
+        K, rows = self.shape
+        J = self.inner.jacobian(*(_after_first(x[index]) for x in states)).reshape(K, -1, rows, D.shape[2])
+        weighted = self.weights[..., None] * np.swapaxes(J, 1, 2)
+        found: Floats = weighted.reshape(K, rows, -1) @ D.reshape(len(D), -1, D.shape[3])[index]
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class BoundOnCubics(BoundConstraint):
+    """A constraint within steps, at the same share of each, on the cubics through their nodes (q, v).
+
+    The places are the nodes at the ends of the steps.
+
+    Attributes:
+        inner: The constraint, bound to a grid whose nodes after the first are the instants.
+        coefficients: Those of (q0, v0, q1, v1) of a step, for q, then for v (8,).
+    """
+
+    inner: BoundConstraint
+    coefficients: Floats
+
+    def _states(self, q: Floats, v: Floats) -> Floats:
+        """The q and v (2, ..., K, n) on the cubics of motions (..., N + 1, n)."""
+        nodes = np.array([x[..., self.places - back, :] for back in (1, 0) for x in (q, v)])
+        return np.tensordot(self.coefficients.reshape(2, 4), nodes, 1)
+
+    def by_nodes(self, of_state: Floats) -> list[Floats]:
+        """Derivatives (K, rows, 2n) in (q, v) at the nodes before and after, of those ``of_state`` on the cubics."""
+        by_q, by_v = np.split(of_state, 2, axis=2)
+        c = self.coefficients
+        return [
+            np.concatenate([c[i] * by_q + c[i + 4] * by_v, c[i + 1] * by_q + c[i + 5] * by_v], axis=2) for i in (0, 2)
+        ]
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """See :meth:`BoundConstraint.value`."""
+        q, v = self._states(q, v)
+        return self.inner.value(_after_first(q[..., None, :]), _after_first(v[..., None, :]), u)
+
+    def jacobian(self, q: Floats, v: Floats) -> Floats:
+        """dc/d(q, v) (K, rows, 2n), in the states on the cubics."""
+        q, v = self._states(q, v)
+        return self.inner.jacobian(_after_first(q[:, None]), _after_first(v[:, None]))
+
+
+def _after_first(x: Floats) -> Floats:
+    """Nodes (..., 1 + K s, n) whose last are the states (..., K, s, n)."""
+    nodes = x.reshape(*x.shape[:-3], -1, x.shape[-1])
+    return np.concatenate([nodes[..., :1, :], nodes], axis=-2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,22 +355,14 @@ def _of_constraints(problem: OptimalControlProblem, instants: Instants) -> dict[
 def _bound(problem: OptimalControlProblem, constraint: int, steps: Integers, moments: Floats) -> BoundBetween:
     """A constraint at the ``moments`` (K, rows) of ``steps`` (K,), several of which may be the same."""
     of_nodes = problem.bound_constraints[constraint]
-    own, index = np.unique(steps, return_inverse=True)
     used = moments >= 0.0
     mean = np.where(used, moments, 0.0).sum(axis=1) / np.maximum(used.sum(axis=1), 1)
-    times = problem.t0 + problem.dt * (steps + mean)
     share = _PARTS * moments
     middle = np.clip(np.rint(share), 1, _PARTS - 1)
-    weights = _on_parabolas(middle, share - middle, used)
-    # The states at which any row of a step needs the constraint.
-    needed = np.zeros((len(own), _PARTS + 1), dtype=bool)
-    np.logical_or.at(needed, index, weights.any(axis=1))
-    samples = np.argwhere(needed)
-    number = np.zeros(needed.shape, dtype=np.int64)
-    number[needed] = np.arange(len(samples))
-    inner = at_times(problem, of_nodes.source, _times(problem, own[samples[:, 0]], samples[:, 1]))
+    inner = at_times(problem, of_nodes.source, _times(problem, steps))
+    times = problem.t0 + problem.dt * (steps + mean)
     given = of_nodes.source, steps + 1, times, of_nodes.rows, of_nodes.unit, of_nodes.scale
-    return BoundBetween(*given, of_nodes, _parts(problem), own, samples, inner, number[index], weights)
+    return BoundBetween(*given, of_nodes, Parts.of(problem), inner, _on_parabolas(middle, share - middle, used))
 
 
 def _on_parabolas(middle: Floats, x: Floats, used: Mask) -> Floats:
@@ -127,9 +377,9 @@ def _on_parabolas(middle: Floats, x: Floats, used: Mask) -> Floats:
     return found
 
 
-def _times(problem: OptimalControlProblem, steps: Integers, samples: Integers) -> Floats:
-    """Times [s] of ends of parts of steps."""
-    found: Floats = problem.t0 + problem.dt * (steps + samples / _PARTS)
+def _times(problem: OptimalControlProblem, steps: Integers) -> Floats:
+    """Times [s] of all ends of parts of steps."""
+    found: Floats = problem.t0 + problem.dt * (steps[:, None] + np.arange(_PARTS + 1) / _PARTS).ravel()
     return found
 
 
@@ -139,11 +389,7 @@ def _on_cubics(problem: OptimalControlProblem, constraint: int, steps: Integers)
     times = problem.t0 + problem.dt * (steps.astype(np.float64) + _MIDDLE)
     inner = at_times(problem, of_nodes.source, times)
     given = of_nodes.source, steps + 1, times, of_nodes.rows, of_nodes.unit, of_nodes.scale
-    return BoundOnCubics(*given, inner, _MIDDLE, cubics(np.array([_MIDDLE]), problem.dt)[0])
-
-
-def _parts(problem: OptimalControlProblem) -> Parts:
-    return Parts(quiet(problem.scene), problem.integrator, problem.dt, _PARTS, problem.linear)
+    return BoundOnCubics(*given, inner, cubics(np.array([_MIDDLE]), problem.dt)[0])
 
 
 def at_times(problem: OptimalControlProblem, constraint: PlanConstraint, times: Floats) -> BoundConstraint:
@@ -206,14 +452,14 @@ def _seen(problem: OptimalControlProblem, motion: Trajectory) -> dict[int, Float
 
     Rows that the start violates are -inf in the first step. Empty where a step cannot be integrated in parts.
     """
-    N, n = motion.steps, problem.scene.robot.dof
-    parts = _parts(problem)
+    N = motion.steps
+    parts = Parts.of(problem)
     controls = parts.controls(problem.control_rows(motion), np.arange(N))
     parted = parts.states(motion.q[:-1], motion.v[:-1], controls)
     if parted is None:
         return {}
-    q, v = (np.concatenate([x[0, :1], x.reshape(-1, n)]) for x in parted)
-    times = _times(problem, *np.divmod(np.arange(N * (_PARTS + 1)), _PARTS + 1))
+    q, v = map(_after_first, parted)
+    times = _times(problem, np.arange(N))
     u, found = np.zeros((len(q), problem.scene.controls)), {}
     for i, (item, looks) in enumerate(zip(problem.bound_constraints, watched(problem), strict=True)):
         if looks:

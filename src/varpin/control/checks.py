@@ -132,7 +132,7 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
             places[goal.label] = goal.frame, np.eye(3), goal.position
     for label, (frame, axes, place) in places.items():
         kinematics = frame_kinematics(robot, frame)
-        most, root = reach(robot, kinematics), kinematics.links.translation[0]
+        most, root = reach(robot, kinematics), kinematics.links.tree.translation[0]
         away = float(np.linalg.norm((np.atleast_2d(place) - root) @ axes, axis=1).max())
         if away > most * (1.0 + _SAME):
             kind, why = "goal out of reach", "no motion gets there"
@@ -150,7 +150,7 @@ def reach(robot: Robot, frame: FrameKinematics) -> float:
 
     It is the shortest chain of hops from joint to joint, or over one revolute joint to the next but one.
     """
-    links = frame.links
+    links = frame.links.tree
     hops = [*links.translation[1:], frame.translation]
     lower, upper = robot.position_limits
     ends = np.array([lower, upper])[:, links.coordinate]

@@ -11,8 +11,8 @@ from scipy.special import ndtr, ndtri
 from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import Status
+from varpin.control.monte_carlo import Paths, joined, simulated, with_margins
 from varpin.control.multipliers import at_nodes, split
-from varpin.control.paths import Paths, joined, simulated, with_margins
 from varpin.control.solution import Solution
 from varpin.errors import VarpinError
 from varpin.finding import Finding

@@ -17,7 +17,7 @@ from varpin.control.constraints import BoundRate
 from varpin.control.costs import CostError
 from varpin.control.history import Status
 from varpin.control.multipliers import REPORTED, ConstraintReport, Multipliers, at_nodes, flat
-from varpin.control.rollout import shifted_commands
+from varpin.control.rollout import first_commands
 from varpin.control.search import Search
 from varpin.errors import InputError, LinearizationError
 from varpin.finding import Finding, announce
@@ -257,7 +257,8 @@ class Mpc:
         if previous is None:
             return solve(problem, tolerance=self.tolerance)
         search = Search(problem, tick=True)
-        search.begin(shifted_commands(problem, previous, min(decisions, problem.decisions - 1)))
+        rest = previous.shifted(min(decisions, problem.decisions - 1), None if problem.rate is None else before)
+        search.begin(first_commands(problem, rest))
         if previous.search is not None:
             search.weight = previous.search.weight
         if previous.multipliers is not None and problem.constraints:

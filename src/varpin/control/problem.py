@@ -6,6 +6,7 @@ Equation (O1) of docs/mathematics.md.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -46,7 +47,6 @@ from varpin.support.checks import (
     flag,
     joint_array,
     named_limits,
-    positive,
     tuple_of,
     word,
 )
@@ -330,14 +330,10 @@ class OptimalControlProblem(Frozen):
                 neither cost nor limit; or as for the problem itself.
         """
         if before is not None and not self.remembers:
-            raise InputError(
-                "before is the control that a ControlRateCost or a WithinControlRate begins with: give one"
-            )
+            raise InputError("before is what a ControlRateCost or a WithinControlRate begins with: give one")
         if dt is not None and steps is None and duration is None:
-            steps = round(self.duration / positive("dt", dt, "s"))
-            if abs(steps * dt - self.duration) > 1e-9 * self.duration:
-                raise InputError(f"the horizon of {self.duration:g} s is no multiple of dt = {dt:g} s")
-        elif duration is not None:
+            duration = self.duration
+        if duration is not None:
             dt, steps = time_steps(self.dt if dt is None and steps is None else dt, steps, duration)
         moved: dict[str, Any] = {"q0": q0, "v0": v0, "t0": t0}
         grid: dict[str, Any] = {"dt": dt, "steps": steps, "integrator": integrator, "sampling": sampling, "hold": hold}
@@ -391,6 +387,7 @@ class OptimalControlProblem(Frozen):
             steps=steps,
             hold=1 if self.linear else self.hold * parts,
             sampling="gauss",
+            places=places,
             rule=rule,
             running=running,
             terminal=terminal,
@@ -428,6 +425,14 @@ class OptimalControlProblem(Frozen):
                 short = max(len(str(theirs)), len(str(mine))) <= _SHORT
                 return f"{name} = {theirs}, not {mine}" if short else f"different {name.replace('.', ' ')}"
         return ""
+
+    def mismatch(self, setting: Mapping[str, Any], trajectory: Trajectory, cost: float) -> str:
+        """Of which other problem a plan's :attr:`setting`, motion and cost are, in words; empty if of this one."""
+        if difference := self.differs(setting):
+            return f"of another problem: {difference}"
+        found = self.cost_of(trajectory)
+        close = math.isclose(found, cost, rel_tol=1e-9)
+        return "" if close else f"of a problem with another cost: {cost:.9g}, and here {found:.9g}"
 
     def constraints_on(
         self, dt: float, steps: int, hold: int, *, linear: bool | None = None
@@ -597,18 +602,9 @@ class OptimalControlProblem(Frozen):
         causes no rounding error.
         """
         q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
-        return self.shares_along(q, v, u, self.running.compiled(*self.samples(q, v, u)))
-
-    def shares_along(self, q: Floats, v: Floats, u: Floats, compiled: Floats) -> Floats:
-        """:meth:`shares` of a motion, q and v (N + 1, n) and u (N, m), or (N + 1, m) at the nodes.
-
-        ``compiled`` are values of the running terms that the core evaluates, at all samples (N s, terms).
-        """
-        weight = self.dt * self.rule[0, 0]
-        found = [weight * compiled.ravel()]
-        if self.running.others:
-            at = self.samples(q, v, u)
-            found += [weight * (factor * part.value(*at)) for factor, part in self.running.others]
+        at, weight = self.samples(q, v, u), self.dt * self.rule[0, 0]
+        found = [weight * self.running.compiled(*at).ravel()]
+        found += [weight * (factor * part.value(*at)) for factor, part in self.running.others]
         found += [values.ravel() for values in self.terminal.shares(q[-1:], v[-1:], np.zeros((1, u.shape[1])))]
         if self.rate is not None:
             found.append(self.rate.shares(u[:: self.hold], self.period))

@@ -1,4 +1,4 @@
-"""Commands of a plan's motions: feedback around a motion, given controls, and an earlier plan shifted."""
+"""Commands of a plan's motions: feedback around a motion, and given controls."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.solution import Solution, rest_of
+from varpin.control.solution import Solution
 from varpin.core.arrays import Commands
 from varpin.errors import InputError
-from varpin.mechanics.scene import closest_controls
 from varpin.signals.commands import open_line, open_loop
 from varpin.signals.policy import LinearPolicy
 from varpin.support.checks import JointValues, as_floats, control_array, finite_array
@@ -96,14 +95,3 @@ def _rows_of(problem: OptimalControlProblem, controls: Any) -> Floats:
         controls = control_array("controls", controls, problem.scene.control_joints)
     rows = as_floats("controls", controls)
     return np.broadcast_to(finite_array("controls", rows, (m,) if rows.ndim == 1 else (R, m)), (R, m))
-
-
-def shifted_commands(problem: OptimalControlProblem, previous: Solution, decisions: int) -> Commands:
-    """The commands of :meth:`Solution.shifted`, with the problem's limits and its previous control."""
-    old, means = previous.problem, None
-    if problem.linear and old.constraints and not any(item.of_controls for item in old.bound_constraints):
-        # Within constraints the last control often leaps, which does not fit beyond the end, where the motion goes on
-        # with the torques that hold the robot there. Limits of their rate keep controls from leaping.
-        means = closest_controls(problem.scene, previous.trajectory.q[-1])
-    before = None if problem.rate is None else problem.rate.before
-    return first_commands(problem, rest_of(previous, previous.policy, decisions, before, means=means))

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from varpin.arrays import Floats, Mask
-from varpin.control.between_nodes import NOWHERE, Instants, enforced, followed
-from varpin.control.constraints import BoundBetween, BoundConstraint
+from varpin.control.between_nodes import NOWHERE, BoundBetween, Instants, enforced, followed
+from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.line_search import Taken, Trial, line_search

@@ -199,7 +199,24 @@ class Solution(Frozen):
         """
         if not 0 <= count("decisions", decisions) < len(self.gains):
             raise InputError(f"decisions must be from 0 to {len(self.gains) - 1}, got {decisions}")
-        return rest_of(self, self.policy, decisions, before)
+        policy, motion, N = self.policy, self.trajectory, len(self.policy.u)
+        later = np.arange(N) + decisions
+        rows = np.minimum(later, N - 1)
+        u, reference, expected = policy.u[rows], policy.reference[rows], policy.u[:0]
+        if self.problem.linear:
+            second = motion.p if policy.on == "momentum" else motion.v
+            reference = np.where((later >= N)[:, None], np.append(motion.q[-1], second[-1]), reference)
+            rows = np.where(later >= N, N // 2, rows)
+            expected = self.controls[decisions, None]
+            before = expected[0] if before is None else before
+        elif policy.previous is not None:
+            expected = policy.previous[rows[:1]]
+        previous_gains = None if policy.previous_gains is None else policy.previous_gains[rows]
+        # A repeated control has itself as its previous one.
+        previous = None if previous_gains is None else np.vstack([expected, u[:-1]])
+        on: Literal["momentum", "velocity"] = "velocity" if policy.on == "velocity" else "momentum"
+        given = u, policy.gains[rows], reference, on
+        return self.problem.policy_of(*given, before=before, previous_gains=previous_gains, previous=previous)
 
     def policy_on(self, x: Literal["momentum", "velocity"], substeps: int = 1) -> LinearPolicy:
         """The policy on (q, p) or on (q, v), each control held over ``substeps`` times as many steps.
@@ -308,43 +325,3 @@ class Solution(Frozen):
             executor=executor,
             progress=progress,
         )
-
-
-def rest_of(
-    plan: Solution,
-    policy: LinearPolicy,
-    decisions: int,
-    before: JointValues | None = None,
-    *,
-    means: Floats | None = None,
-) -> LinearPolicy:
-    """:meth:`Solution.shifted` of the plan's ``policy`` on (q, p) or (q, v).
-
-    With ``means`` (m,) lines beyond the plan's end have these mean controls, as far as limits allow, and no feedback.
-    """
-    N = len(policy.u)
-    later = np.arange(N) + decisions
-    rows, expected = np.minimum(later, N - 1), policy.u[:0]
-    u, reference = policy.u[rows], policy.reference[rows]
-    if plan.problem.linear:
-        beyond, motion = later > N - 1, plan.trajectory
-        second = motion.p if policy.on == "momentum" else motion.v
-        rows = np.where(beyond, N // 2, rows)
-        reference = np.where(beyond[:, None], np.append(motion.q[-1], second[-1]), reference)
-        expected = plan.controls[decisions, None]
-        before = expected[0] if before is None else before
-    elif policy.previous is not None:
-        expected = policy.previous[rows[:1]]
-    gains = policy.gains[rows]
-    previous_gains = None if policy.previous_gains is None else policy.previous_gains[rows]
-    if plan.problem.linear and means is not None:
-        for k in np.flatnonzero(beyond):
-            u[k] = np.clip(2.0 * means - (u[k - 1] if k > 0 else expected[0]), *policy.limits)
-        gains[beyond] = 0.0
-        if previous_gains is not None:
-            previous_gains[beyond] = 0.0
-    # A repeated control has itself as its previous one.
-    previous = None if previous_gains is None else np.vstack([expected, u[:-1]])
-    on: Literal["momentum", "velocity"] = "velocity" if policy.on == "velocity" else "momentum"
-    given = u, gains, reference, on
-    return plan.problem.policy_of(*given, before=before, previous_gains=previous_gains, previous=previous)

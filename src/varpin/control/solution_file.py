@@ -86,15 +86,15 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
     # First the motion, whose masses give a clearer message for another robot.
     motion = replace(Trajectory.of_members(source, members, scene.robot), scene_values=scene.values)
     known = [name for name in members if name.startswith(("problem.", "scene."))]
-    if difference := problem.differs({name.removeprefix("problem."): np.asarray(members[name]) for name in known}):
+    setting = {name.removeprefix("problem."): np.asarray(members[name]) for name in known}
+    if difference := problem.differs(setting):
         raise FileError(f"{source} is of another problem: {difference}")
     sizes = {"decisions": problem.decisions, "controls": scene.controls, "states": 2 * scene.robot.dof}
     plan = record_of(_Plan, members, source, sizes=sizes)
     if plan.status not in Status.__members__:
         raise FileError(f"{source}: there is no status {plan.status!r}")
-    found = problem.cost_of(motion)
-    if not abs(found - plan.cost) <= 1e-9 * max(abs(found), abs(plan.cost)):
-        raise FileError(f"{source} is of a problem with another cost: {plan.cost:.9g}, and here {found:.9g}")
+    if other := problem.mismatch(setting, motion, plan.cost):
+        raise FileError(f"{source} is {other}")
     if bool(problem.constraints) != (plan.multipliers is not None):
         raise FileError(f"{source}: multipliers of the problem's constraints do not belong to it, or are missing")
     if plan.multipliers is not None:

@@ -15,13 +15,13 @@ from varpin.control.history import ITERATIONS, Iteration, Status
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refine import SUFFICIENT, refine
 from varpin.control.rollout import controls_along, first_commands
-from varpin.control.search import Report, Search
+from varpin.control.search import Search
 from varpin.control.solution import Solution
 from varpin.control.starts import Path, commands_along, path_of
 from varpin.errors import InputError
 from varpin.finding import announce
 from varpin.signals.policy import LinearPolicy
-from varpin.support.checks import JointValues, count, flag, positive, real, takes, told_motion
+from varpin.support.checks import JointValues, count, flag, positive, real, told_motion
 from varpin.support.one_thread import one_thread
 from varpin.trajectory import Trajectory
 
@@ -125,14 +125,18 @@ def solve(
     if not real("regularization", regularization) >= 0.0:
         raise InputError(f"regularization must be >= 0, got {regularization}")
     second_order, check = flag("second_order", second_order), flag("check", check)
-    report_all = require_reports(callback, progress)
+    told: Any = callback
+    with_motion = told_motion("callback", callback, "iteration", "motion")
+    told_motion("progress", progress, "iterations done, max_iterations")
     positive("tolerance", tolerance, "1")
-    deadline = time.perf_counter() + checked_time(time_limit)
-    most = count("max_iterations", max_iterations)
-    if resume is not None and true_cost is not None:
-        raise InputError("true_cost begins with a search of its own: leave out either resume or true_cost")
-    if states is not None and resume is not None:
-        raise InputError("resume goes on from the solution's own states: leave out either states or resume")
+    unlimited = real("time_limit", time_limit) == np.inf
+    limit = np.inf if unlimited else positive("time_limit", time_limit, "s")
+    deadline, most = time.perf_counter() + limit, count("max_iterations", max_iterations)
+    if resume is not None:
+        for name, given in (("controls", controls), ("states", states), ("true_cost", true_cost)):
+            if given is not None:
+                raise InputError(f"resume goes on with the solution's own search: leave out either {name} or resume")
+        _require_resumable(problem, resume)
     path = None if states is None else path_of(problem, states)
     if check:
         # The search may take long where values are in wrong units.
@@ -147,7 +151,6 @@ def solve(
     ) -> Solution:
         search = Search(problem, second_order=second_order, regularization=regularization)
         if resume is not None:
-            _require_resumable(problem, controls, resume)
             search.resume(resume)
         elif path is not None:
             search.begin(commands_along(problem, path, controls_along(problem, controls)))
@@ -156,7 +159,8 @@ def solve(
         known = len(search.history)
 
         def report(item: Iteration, motion: Trajectory) -> None:
-            report_all(item, motion)
+            if told is not None:
+                told(*((item, motion) if with_motion else (item,)))
             if progress is not None:
                 # A converged search reports once more after its last iteration.
                 progress(min(item.index + 1 - known, most), most)
@@ -183,40 +187,11 @@ def solve(
     return looked_at(solution) if check else solution
 
 
-def _require_resumable(problem: OptimalControlProblem, controls: object, resume: Solution) -> None:
+def _require_resumable(problem: OptimalControlProblem, resume: Solution) -> None:
+    """Raise an InputError unless ``resume`` is a solution of the problem with the state of its search."""
     if not isinstance(resume, Solution):
         raise InputError(f"resume must be a Solution, got {type(resume).__name__}")
-    if controls is not None:
-        raise InputError("resume goes on from the solution's own controls: leave out either controls or resume")
     if resume.search is None:
         raise InputError("resume: the solution does not hold the state of its search; give it as controls")
-    difference = problem.differs(resume.problem.setting)
-    if difference:
-        raise InputError(f"resume: the solution is of another problem: {difference}; give it as controls")
-    found, known = problem.cost_of(resume.trajectory), resume.cost
-    if not abs(found - known) <= 1e-9 * max(abs(found), abs(known)):
-        raise InputError(f"resume: the solution is of another cost: {known:.9g}, and here {found:.9g}")
-
-
-def require_reports(callback: Any, progress: object) -> Report:
-    """The callback as a function of an iteration and its motion, whether or not it takes the motion.
-
-    Raises:
-        InputError: The callback or ``progress`` has the wrong number of arguments.
-    """
-    both = told_motion("callback", callback, "iteration", "motion")
-    if progress is not None and not (callable(progress) and takes(progress, 2)):
-        raise InputError(f"progress must be a function of (iterations done, max_iterations), got {progress!r}")
-
-    def report_all(item: Iteration, motion: Trajectory) -> None:
-        if both:
-            callback(item, motion)
-        elif callback is not None:
-            callback(item)
-
-    return report_all
-
-
-def checked_time(limit: object) -> float:
-    """A time limit [s] as a float > 0, infinite for none."""
-    return np.inf if isinstance(limit, float) and limit == np.inf else positive("time_limit", limit, "s")
+    if other := problem.mismatch(resume.problem.setting, resume.trajectory, resume.cost):
+        raise InputError(f"resume: the solution is {other}; give it as controls")

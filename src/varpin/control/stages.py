@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from varpin.arrays import Floats, Integers, Mask
-from varpin.control.constraints import BoundBetween, BoundConstraint, BoundOnCubics, BoundRate
+from varpin.control.between_nodes import BoundBetween, BoundOnCubics
+from varpin.control.constraints import BoundConstraint, BoundRate
 from varpin.control.costs import CostError, Expansion
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.samples import after_impulse, at_samples, beyond_samples
@@ -460,23 +461,17 @@ class Stages(Frozen):
             at = np.stack([layout.control(bound.places - 1)[:, columns], layout.control(bound.places)[:, columns]], 2)
             pair = np.broadcast_to(np.array([-1.0, 1.0]) / bound.period, at.shape)
             return np.concatenate([at, at], axis=1).reshape(-1, 2), np.concatenate([pair, -pair], 1).reshape(-1, 2)
-        if isinstance(bound, BoundOnCubics):
-            parts = bound.by_nodes(bound.jacobian(motion.q, motion.v))
-            nodes = bound.places - 1, bound.places
-            found = [self._at_nodes(k, part, None) for k, part in zip(nodes, parts, strict=True)]
-            return np.concatenate([at for at, _ in found], axis=1), np.concatenate([J for _, J in found], axis=1)
-        slopes = bound.slopes(motion.q, motion.v, self.steps.problem.control_rows(motion))
-        controls = slopes.by_controls if isinstance(bound, BoundBetween) else None
-        return self._at_nodes(slopes.nodes, slopes.by_state, controls)
-
-    def _at_nodes(self, nodes: Integers, by_state: Floats, by_controls: Floats | None) -> tuple[Integers, Floats]:
-        """Indices and derivatives of rows, each (P, Z), from those (K, rows, 2n) in (q, v) of nodes and of controls."""
-        of_x, layout = by_state @ self.steps.slopes[nodes], self.layout
-        if by_controls is None:
-            at, J = layout.state(nodes), of_x
+        if isinstance(bound, BoundBetween):
+            J = bound.slopes(motion.q, motion.v, self.steps.problem.control_rows(motion))
+            x, at = layout.states, layout.in_stage(bound.begins)
+            J = np.concatenate([J[:, :, :x] @ self.steps.slopes[bound.begins], J[:, :, x:]], axis=2)
         else:
-            at, J = layout.in_stage(nodes), np.concatenate([of_x, by_controls], axis=2)
-        return np.repeat(at, J.shape[1], axis=0), J.reshape(-1, J.shape[2])
+            nodes, slopes = [bound.places], [bound.jacobian(motion.q, motion.v)]
+            if isinstance(bound, BoundOnCubics):
+                nodes, slopes = [bound.places - 1, bound.places], bound.by_nodes(slopes[0])
+            at = np.concatenate([layout.state(k) for k in nodes], axis=1)
+            J = np.concatenate([part @ self.steps.slopes[k] for k, part in zip(nodes, slopes, strict=True)], axis=2)
+        return np.repeat(at, len(bound.rows), axis=0), J.reshape(-1, J.shape[2])
 
     def change(self, z: Floats) -> tuple[float, float]:
         """The slope of the cost along z, and its change at z by the quadratic model."""

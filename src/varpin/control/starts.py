@@ -45,8 +45,7 @@ def path_of(problem: OptimalControlProblem, given: Any) -> Path:
             raise InputError(f"states: the motion is of joints {given.joint_names}, the problem of {names}")
         if given.steps == problem.steps and not np.isclose(given.dt, problem.dt, rtol=1e-6):
             raise InputError(
-                f"states: the motion has dt = {given.dt:g} s, the problem {problem.dt:g} s; states=motion.q follows "
-                "its path at the problem's pace"
+                f"states: the motion has dt = {given.dt:g} s, the problem {problem.dt:g} s: give its q alone"
             )
         q, v = given.q, given.v
     elif isinstance(given, tuple):
@@ -60,7 +59,7 @@ def path_of(problem: OptimalControlProblem, given: Any) -> Path:
     if off[joint] > _SAME:
         raise InputError(
             f"states must begin at the problem's q0: joint {names[joint]!r} is at {positions[0, joint]:.6g} in their "
-            f"first row, and at {problem.q0[joint]:.6g} in q0" + (f"; {units}" if units else "")
+            f"first row, and at {problem.q0[joint]:.6g} in q0{'; ' if units else ''}{units}"
         )
     if units:
         logger.warning("%s", units)
@@ -82,11 +81,13 @@ def commands_along(problem: OptimalControlProblem, path: Path, controls: Floats 
     if u is None:
         u = as_moved(scene, q[hold::hold], v[hold::hold], _joint_forces(problem, q, v) @ scene.allocation.T)
         u = np.clip(u, *problem.control_limits)
-    gains = _holding_gains(problem)
-    gains[scene.prescribed] = 0.0
+    M = lagrangian_jet(scene, problem.q0, np.zeros(scene.robot.dof)).Lvv
+    omega, on_speed = _HOLDING_FREQUENCY / problem.period, M
     q, v = q[:-1:hold], v[:-1:hold]
     if problem.integrator.variational:
-        v = (node_jets(scene, q, v)[0] @ v[:, :, None])[:, :, 0]
+        v, on_speed = (node_jets(scene, q, v)[0] @ v[:, :, None])[:, :, 0], np.eye(len(M))
+    gains = scene.allocation @ -np.hstack([omega**2 * M, 2.0 * omega * on_speed])
+    gains[scene.prescribed] = 0.0
     x = np.hstack([q, v])
     if not problem.linear:
         return around(problem, u, x, np.tile(gains, (len(u), 1, 1)), None)
@@ -97,19 +98,9 @@ def commands_along(problem: OptimalControlProblem, path: Path, controls: Floats 
     u = problem.begun(u)
     # A line answers a state half a step later than a held control, so that feedback may do harm.
     tries = [
-        around(problem, u, x, np.tile(share * gains, (len(u), 1, 1)), np.zeros((len(u), m, m))) for share in (1.0, 0.0)
+        around(problem, u, x, np.tile(own, (len(u), 1, 1)), np.zeros((len(u), m, m))) for own in (gains, 0 * gains)
     ]
     return min(tries, key=lambda commands: _cost_under(problem, commands))
-
-
-def _holding_gains(problem: OptimalControlProblem) -> Floats:
-    """Gains (m, 2n) of the controls that hold a motion on states, (q, p) or (q, v)."""
-    scene, n = problem.scene, problem.scene.robot.dof
-    M = lagrangian_jet(scene, problem.q0, np.zeros(n)).Lvv
-    omega = _HOLDING_FREQUENCY / problem.period
-    on_speed = np.eye(n) if problem.integrator.variational else M
-    found: Floats = scene.allocation @ -np.hstack([omega**2 * M, 2.0 * omega * on_speed])
-    return found
 
 
 def _cost_under(problem: OptimalControlProblem, commands: Commands) -> float:

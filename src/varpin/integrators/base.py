@@ -32,7 +32,7 @@ from varpin.signals.commands import (
     steps_of,
     with_ends,
 )
-from varpin.trajectory import Bytes, StepStatistics, Trajectory, joined
+from varpin.trajectory import StepStatistics, Trajectory, joined
 
 # Fields of a segment with one row for each node.
 _ARRAYS = ("q", "p", "v", "u", "energy")
@@ -40,12 +40,7 @@ _ARRAYS = ("q", "p", "v", "u", "energy")
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a rollout stopped before its end.
-
-    Attributes:
-        reason: The reason as text.
-        residual: The last residual, in units of its rounding error.
-    """
+    """Why a rollout stopped before its end, and its last residual, in units of the rounding error."""
 
     reason: str
     residual: float
@@ -90,8 +85,7 @@ class Integrator(ABC):
     1. ``start``, which returns the state of a rollout at (q0, v0) and the first node, and ``fork``, which copies a
        state;
     2. ``rollout_compiled``, which advances a state by many steps of many paths in the core;
-    3. ``linearize``, the derivatives of its steps, ``linearize_with_ramps`` if it evaluates controls within a step, and
-       ``quiet_ends`` if it applies noise after a step too;
+    3. ``linearize``, the derivatives of its steps, and ``quiet_ends`` if it applies noise after a step too;
     4. ``variational``, True if it maps (q, p) and False if it maps (q, v), and ``order``.
     """
 
@@ -211,28 +205,20 @@ class Integrator(ABC):
         raise NotImplementedError(f"{self} does not kick after the step")
 
     @abstractmethod
-    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
+    def linearize(
+        self, scene: Scene, trajectory: Trajectory, *, ramps: bool = False
+    ) -> tuple[Floats, Floats, Floats, Floats]:
         """Derivatives of each step at dw = 0.
 
-        They are taken in the state (N, 2n, 2n), in a constant force (N, 2n, n), and in the noise impulse (N, 2n, n), a
-        jump of the momentum, or of the velocity for integrators on (q, v). For integrators that hold the noise of a
-        step, the last ones are those in the impulse of a constant force.
+        They are taken in the state (N, 2n, 2n), in a constant force (N, 2n, n), in the noise impulse (N, 2n, n), a
+        jump of the momentum, or of the velocity for integrators on (q, v), and, with ``ramps``, in the end of a force
+        that grows linearly over the step from 0 (N, 2n, n): half of that in a constant force for methods that hold the
+        mean force. For integrators that hold the noise of a step, those in the noise impulse are those in the impulse
+        of a constant force.
 
         Raises:
             LinearizationError: A step has no solution at dw = 0.
         """
-
-    def linearize_with_ramps(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
-        """The three results of :meth:`linearize`, and derivatives (N, 2n, n) in a force that grows over each step.
-
-        It grows linearly from 0, and the derivatives are those in its value at the end of the step.
-
-        Raises:
-            LinearizationError: A step has no solution at dw = 0.
-        """
-        Jx, Jf, Jk = self.linearize(scene, trajectory)
-        # Methods that hold the mean force take half of it.
-        return Jx, Jf, Jk, 0.5 * Jf
 
     def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:  # noqa: ARG002
         """Second derivatives sum_a z_a d2 x1_a of each step at dw = 0 in (x0, f), (N, 3n, 3n), for z (N, 2n).
@@ -396,10 +382,9 @@ def diffusion_and_drift(
 def noise_of_step(
     scene: Scene, F: Floats, q: Floats, v: Floats, ends: tuple[Floats, Floats], start: Floats, dw: Floats
 ) -> Floats:
-    """The impulse (n,) of increments dw (K,) at a state (q, v), by fields in Python.
+    """The impulse (n,) of increments dw (K,) at a state, by fields in Python, F (n, k) of the mean control.
 
-    ``F`` (n, k) are those of the mean control, ``ends`` (1, m) the controls at both ends of the step, ``start`` (n,)
-    the configuration at the start of the motion.
+    ``ends`` (1, m) are the controls at both ends of the step, ``start`` (n,) is the configuration at the motion's start.
     """
     k = scene.processes
     impulse: Floats = F @ dw[:k]
@@ -474,47 +459,22 @@ def segments_of(nodes: RolloutArrays, reasons: Mapping[int, str], paths: Any = N
     """
     segments = []
     for i, done in enumerate(nodes.done.tolist()):
-        parts = parts_of(nodes, i, done, paths)
-        statistics, failure = statistics_of(nodes, i, done, parts), failure_of(nodes, i, done, reasons)
-        segments.append(
-            Segment(
-                q=nodes.q[i, :done],
-                p=nodes.p[i, :done],
-                v=nodes.v[i, :done],
-                u=nodes.u[i, :done],
-                energy=nodes.energy[i, :done],
-                statistics=statistics,
-                failure=failure,
-            )
+        tally, quality, ended = nodes.tally[i, :done], nodes.quality[i, :done], int(nodes.ended[i])
+        split = done > 0 and tally[:, 3].max() > 1
+        statistics = StepStatistics(
+            newton_iterations=tally[:, 0],
+            jets=tally[:, 1],
+            sweeps=tally[:, 2],
+            substeps=tally[:, 3],
+            halvings=paths.halvings(i) if split else np.zeros(0, dtype=np.uint8),
+            residual=quality[:, 0],
+            branch_margin=quality[:, 1],
+            energy_defect=quality[:, 2],
         )
+        own = {name: getattr(nodes, name)[i, :done] for name in _ARRAYS}
+        failure = Failure(reasons[ended], float(nodes.quality[i, done, 0])) if ended in reasons else None
+        segments.append(Segment(**own, statistics=statistics, failure=failure))
     return segments
-
-
-def statistics_of(nodes: RolloutArrays, path: int, done: int, halvings: Bytes) -> StepStatistics:
-    """The statistics of a path's steps, as views."""
-    tally, quality = nodes.tally[path, :done], nodes.quality[path, :done]
-    return StepStatistics(
-        newton_iterations=tally[:, 0],
-        jets=tally[:, 1],
-        sweeps=tally[:, 2],
-        substeps=tally[:, 3],
-        halvings=halvings,
-        residual=quality[:, 0],
-        branch_margin=quality[:, 1],
-        energy_defect=quality[:, 2],
-    )
-
-
-def parts_of(nodes: RolloutArrays, path: int, done: int, paths: Any) -> Bytes:
-    """The halvings of a path's steps; none where no step was divided."""
-    split = done > 0 and nodes.tally[path, :done, 3].max() > 1
-    return paths.halvings(path) if split else np.zeros(0, dtype=np.uint8)
-
-
-def failure_of(nodes: RolloutArrays, path: int, done: int, reasons: Mapping[int, str]) -> Failure | None:
-    """Why a path stopped before its end, if it did."""
-    ended = int(nodes.ended[path])
-    return Failure(reasons[ended], float(nodes.quality[path, done, 0])) if ended in reasons else None
 
 
 def first_nodes(q: Floats, p: Floats, v: Floats, energy: Floats, controls: int) -> list[Segment]:

@@ -74,11 +74,15 @@ class _Explicit(Compiled):
             state.paths.v[0] += np.linalg.solve(mass(scene, state.paths.q[0]), impulse)
         return self.rollout_compiled(scene, state, command, scene.silence, drift[None, None], dt)[0]
 
-    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
+    def linearize(
+        self, scene: Scene, trajectory: Trajectory, *, ramps: bool = False
+    ) -> tuple[Floats, Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, v)."""
         refuse_constraints(scene, self)
         Jx, Jf = self._derivatives(scene, trajectory)
-        return Jx, Jf, self._jump(Jx[:, :, scene.robot.dof :])
+        ramp = ramps and bool(self.stage_times)
+        Jr = self._derivatives(scene, trajectory, ramp=True)[1] if ramp else 0.5 * Jf
+        return Jx, Jf, self._jump(Jx[:, :, scene.robot.dof :]), Jr
 
     def _derivatives(self, scene: Scene, trajectory: Trajectory, *, ramp: bool = False) -> tuple[Floats, Floats]:
         h = trajectory.dt
@@ -140,6 +144,3 @@ class RungeKutta4(_Explicit):
     method: ClassVar[ExplicitMethod] = ExplicitMethod.runge_kutta
     order = 4
     stage_times = (0.0, 0.5, 1.0)
-
-    def linearize_with_ramps(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
-        return *self.linearize(scene, trajectory), self._derivatives(scene, trajectory, ramp=True)[1]

@@ -34,13 +34,7 @@ TOO_STEEP = "the adaptive method cannot go on: the motion runs away, or its tole
 
 @dataclass
 class ReferenceRun:
-    """State of a rollout.
-
-    Attributes:
-        x: (q, v) of each path (P, 2n).
-        dynamics: Forward dynamics at a single state.
-        tried: Length of the last internal step [s], the first trial of the next; 0 for none.
-    """
+    """State of a rollout: (q, v) of each path (P, 2n), forward dynamics, and the last internal step [s], 0 for none."""
 
     x: Floats
     dynamics: ForwardDynamics
@@ -84,11 +78,7 @@ class Reference(Integrator):
         return tuple(gauss_coefficients(_POINTS)[2].tolist())
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[ReferenceRun, list[Segment]]:
-        """See :meth:`Integrator.start`.
-
-        Raises:
-            InputError: The scene has noise.
-        """
+        """See :meth:`Integrator.start`."""
         refuse_constraints(scene, self)
         if scene.processes:
             raise InputError(f"{self} integrates no noise: leave it out of the scene")
@@ -190,7 +180,9 @@ class Reference(Integrator):
         unit = self.rtol if self.atol is None else self.atol
         return unit * np.concatenate([np.ones(n), np.full(n, speed)])
 
-    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
+    def linearize(
+        self, scene: Scene, trajectory: Trajectory, *, ramps: bool = False
+    ) -> tuple[Floats, Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, v).
 
         The variational equations are integrated along with the motion, under the same tolerances.
@@ -198,11 +190,9 @@ class Reference(Integrator):
         refuse_constraints(scene, self)
         n = scene.robot.dof
         J = self._linearized(scene, trajectory)
-        return J[:, :, : 2 * n], J[:, :, 2 * n :], J[:, :, n : 2 * n]
-
-    def linearize_with_ramps(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
-        in_ramp = self._linearized(scene, trajectory, ramp=True)[:, :, 2 * scene.robot.dof :]
-        return *self.linearize(scene, trajectory), in_ramp
+        Jx, Jf = J[:, :, : 2 * n], J[:, :, 2 * n :]
+        Jr = self._linearized(scene, trajectory, ramp=True)[:, :, 2 * n :] if ramps else 0.5 * Jf
+        return Jx, Jf, J[:, :, n : 2 * n], Jr
 
     def _linearized(self, scene: Scene, trajectory: Trajectory, *, ramp: bool = False) -> Floats:
         """Derivatives (N, 2n, 3n) of each step in (q, v, force)."""

@@ -78,11 +78,7 @@ def _value(node: ast.expr) -> Any:
 
 
 def require_motion(scene: Scene, trajectory: Trajectory) -> None:
-    """Refuse anything but a trajectory of a scene's robot with the scene's number of controls.
-
-    Raises:
-        InputError: It is not one; the message tells the difference.
-    """
+    """Refuse anything but a trajectory of a scene's robot with the scene's number of controls."""
     require_trajectory(trajectory)
     if trajectory.joint_names != scene.robot.joint_names:
         raise InputError(
@@ -94,13 +90,7 @@ def require_motion(scene: Scene, trajectory: Trajectory) -> None:
 
 
 def require_scene_of(scene: Scene, trajectory: Trajectory) -> None:
-    """Refuse a motion of a scene with other numbers, as far as the motion has them.
-
-    Noise is compared only if the motion has increments: a motion without noise does not depend on it.
-
-    Raises:
-        InputError: The scenes differ; the message tells where.
-    """
+    """Refuse a motion of a scene with other numbers, as far as the motion has them; of noise if it has increments."""
     found = differences(scene, trajectory.scene_values, noise=bool(trajectory.dw.any()))
     if not same(trajectory.masses, scene.robot.tree.mass):
         found.insert(0, "the robot's masses")

@@ -184,11 +184,7 @@ class Variational(Compiled):
         return run, first_nodes(q, p, v, energy, scene.controls)
 
     def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
-        """See :meth:`Compiled.begun`.
-
-        Raises:
-            SingularMassMatrix: M(q0) is not positive definite.
-        """
+        """See :meth:`Compiled.begun`."""
         guards, places = self._guards(energy=not scene.inputs), self._places(scene) if scene.constraints else None
         method = scene.core, self._tableau(), float(self.tolerance), guards, self.left
         rollout = Rollout(*method, len(q0), self.holds_noise, places)
@@ -219,19 +215,16 @@ class Variational(Compiled):
             state.paths.kick(self.left * impulse[None])
         return self.rollout_compiled(scene, state, command, scene.silence, drift[None, None], dt, held)[0]
 
-    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
+    def linearize(
+        self, scene: Scene, trajectory: Trajectory, *, ramps: bool = False
+    ) -> tuple[Floats, Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, p).
 
         Divided steps are repeated in the same parts, and the derivatives of the parts are multiplied.
         """
-        Jx, Jf, _ = self._derivatives(scene, trajectory)
-        return Jx, Jf, self._kicks(scene, trajectory, Jx, Jf)
-
-    def linearize_with_ramps(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
-        if not self.stage_times:
-            return super().linearize_with_ramps(scene, trajectory)
-        Jx, Jf, Jr = self._derivatives(scene, trajectory, ramp=True)
-        return Jx, Jf, self._kicks(scene, trajectory, Jx, Jf), Jr
+        ramp = ramps and bool(self.stage_times)
+        Jx, Jf, Jr = self._derivatives(scene, trajectory, ramp=ramp)
+        return Jx, Jf, self._kicks(scene, trajectory, Jx, Jf), Jr if ramp else 0.5 * Jf
 
     def _kicks(self, scene: Scene, trajectory: Trajectory, Jx: Floats, Jf: Floats) -> Floats:
         """The derivatives in the noise impulse, from those in the state and in a constant force."""
@@ -270,11 +263,7 @@ class Variational(Compiled):
         return Jx, Jf, Jr
 
     def _contract_by_differences(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
-        """:meth:`contract` under constraints, by differences of the gradients z' J with exact derivatives J.
-
-        Momenta and forces are scaled by the mass matrix to equal speeds, since heavy and light joints differ by orders
-        of magnitude.
-        """
+        """:meth:`contract` under constraints, by differences of z' J with exact derivatives J, scaled by M."""
         n, N = scene.robot.dof, trajectory.steps
         rates, cubic = _rates(scene, trajectory)
         wide = 3 * n + len(cubic)
@@ -350,10 +339,7 @@ class Variational(Compiled):
         }
 
     def _guess(self, trajectory: Trajectory) -> Floats:
-        """Initial stage velocities (N, s, n) for every step at dw = 0, from the cubic through both nodes.
-
-        With noise that step starts from another momentum, so the guess is the velocity at its start.
-        """
+        """Stage velocities (N, s, n) at dw = 0 from the cubic through both nodes; with noise, those at the starts."""
         v, moved, times = trajectory.v, np.diff(trajectory.q, axis=0), self._times()
         if trajectory.noisy:
             return np.repeat(v[:-1, None], len(times), axis=1)

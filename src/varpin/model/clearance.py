@@ -14,13 +14,13 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError
-from varpin.model.hull import Hull, hull_around, mesh_points
+from varpin.model.hull import Hull, hull_around
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
-from varpin.model.meshes import shape_points
+from varpin.model.meshes import joined, read_mesh, shape_points
 from varpin.model.robot import Robot, readable_geometry
 from varpin.model.tree import place_of_frame, z_to
 from varpin.model.urdf import read_xml
-from varpin.support.checks import finite_array, over_time, positive, rotation_matrix
+from varpin.support.checks import finite_array, over_time, path_like, positive, rotation_matrix
 from varpin.support.frozen import Frozen
 
 coal = pin.coal
@@ -108,7 +108,8 @@ class Obstacle(Frozen):
         Raises:
             FileError: The file is missing or is no mesh that can be read.
         """
-        found = hull_around(f"vertices of the mesh {path}", mesh_points(path, scale))
+        file, factor = path_like("mesh path", path), positive("mesh scale", scale, "1")
+        found = hull_around(f"vertices of the mesh {path}", joined(read_mesh(str(file))).vertices * factor)
         return cls._placed(found, position, rotation, Path(path).stem if name is None else name)
 
     @classmethod
@@ -149,16 +150,15 @@ class Obstacle(Frozen):
         return over_time(f"the way of obstacle {self.name!r}", self.shift, times, 3)
 
     def __repr__(self) -> str:
-        moving = "" if self.shift is None else f".moving({self.shift!r})"
+        kind, given = "capsule", [self.begin.tolist(), self.end.tolist(), self.radius]
         if self.sides is not None:
-            sides, turn = self.sides.tolist(), self.rotation.tolist()
-            return f"Obstacle.box({self.begin.tolist()}, {sides}, {turn}, {self.name!r}){moving}"
-        if self.hull is not None:
-            points, turn = self.hull.points.tolist(), self.rotation.tolist()
-            return f"Obstacle.convex({points}, {self.begin.tolist()}, {turn}, {self.name!r}){moving}"
-        if self.begin is self.end:
-            return f"Obstacle.sphere({self.begin.tolist()}, {self.radius!r}, {self.name!r}){moving}"
-        return f"Obstacle.capsule({self.begin.tolist()}, {self.end.tolist()}, {self.radius!r}, {self.name!r}){moving}"
+            kind, given = "box", [self.begin.tolist(), self.sides.tolist(), self.rotation.tolist()]
+        elif self.hull is not None:
+            kind, given = "convex", [self.hull.points.tolist(), self.begin.tolist(), self.rotation.tolist()]
+        elif self.begin is self.end:
+            kind, given = "sphere", [self.begin.tolist(), self.radius]
+        moving = "" if self.shift is None else f".moving({self.shift!r})"
+        return f"Obstacle.{kind}({', '.join(map(repr, [*given, self.name]))}){moving}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -402,13 +402,8 @@ def _disabled(robot: Robot, srdf: Path | None) -> set[frozenset[str]]:
     root = read_xml(srdf)
     pairs = {frozenset((e.get("link1", ""), e.get("link2", ""))) for e in root.findall("disable_collisions")}
     links = {link for pair in pairs for link in pair}
-    unknown = sorted(links - {frame.name for frame in robot.free_model.frames})
-    if len(unknown) == len(links):
-        what = f"of {', '.join(map(repr, unknown[:3]))}{', ...' if unknown[3:] else ''}" if links else "no pairs at all"
-        raise InputError(
-            f"{srdf} leaves out no pair of links of robot {robot.name!r}: its disable_collisions are {what}. Give the "
-            "robot's own SRDF"
-        )
+    if links.isdisjoint(frame.name for frame in robot.free_model.frames):
+        raise InputError(f"{srdf} leaves out no pair of links of robot {robot.name!r}: give the robot's own SRDF")
     return pairs
 
 
@@ -429,8 +424,7 @@ def capsule_around(points: Floats) -> tuple[Floats, Floats, float]:
     """Ends and radius of the smallest capsule around points (N, 3) with its axis along one of their principal axes."""
     center = points.mean(axis=0)
     axes = np.linalg.svd(points - center, full_matrices=False)[2]
-    best: tuple[Floats, Floats, float] | None = None
-    least = np.inf
+    found = []
     for i, axis in enumerate(axes):
         across = np.delete(axes, i, axis=0)
         lateral = (points - center) @ across.T
@@ -443,9 +437,9 @@ def capsule_around(points: Floats) -> tuple[Floats, Floats, float]:
         if low > high:
             low = high = 0.5 * (low + high)
         volume = radius**2 * (high - low) + 4.0 / 3.0 * radius**3
-        if volume < least:
-            base = center + middle @ across
-            best, least = (base + low * axis, base + high * axis, radius), volume
-    if best is None or not best[2] > 0.0:
+        base = center + middle @ across
+        found.append((volume, i, base + low * axis, base + high * axis, radius))
+    _, _, begin, end, radius = min(found)
+    if not radius > 0.0:
         raise InputError("points of no extent have no capsule around them")
-    return best
+    return begin, end, radius

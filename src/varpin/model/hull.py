@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -14,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
-from varpin.model.meshes import joined, read_mesh
-from varpin.support.checks import as_floats, path_like, positive, require_finite
+from varpin.support.checks import as_floats, require_finite
 from varpin.support.frozen import Frozen
 
 coal = pin.coal
@@ -77,10 +75,3 @@ def hull_around(name: str, points: ArrayLike) -> Hull:
     if most > _EDGES:
         raise InputError(f"{name} have a hull with {most} edges at one vertex, more than {_EDGES}: give fewer points")
     return Hull(corners, faces)
-
-
-def mesh_points(path: str | os.PathLike[str], scale: float) -> Floats:
-    """The vertices (N, 3) [m] of a mesh file, times ``scale``."""
-    file = path_like("mesh path", path)
-    factor = positive("mesh scale", scale, "1")
-    return joined(read_mesh(str(file))).vertices * factor

@@ -8,15 +8,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from varpin.arrays import Floats, Integers
+from varpin.arrays import Floats
 from varpin.core import Links as Core
 from varpin.core.arrays import Tree
 from varpin.errors import InputError
-from varpin.model.tree import frame_on_body
+from varpin.model.tree import place_of_frame
 from varpin.support.frozen import Frozen
 
 if TYPE_CHECKING:
     from varpin.model.robot import Robot
+
+
+# What the core's links take of a tree's bodies.
+_BODY = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio", "offset", "mass", "center")
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,55 +28,31 @@ class Links(Frozen):
     """Some bodies of a robot's tree with all their ancestors, each on one joint.
 
     Attributes:
-        parent: Parent of each body, as an index among these bodies (c,), -1 at a root; parents come first.
-        prismatic: 1 for a prismatic joint, 0 for a revolute one (c,).
-        rotation: Rotation of the joint frame in its parent's frame at joint position 0 (c, 3, 3).
-        translation: Translation of the joint frame, likewise (c, 3) [m].
-        coordinate: Index, among all n, of the coordinate that moves the joint (c,).
-        ratio: Ratio of the joint position to the coordinate (c,).
-        offset: Joint position where the coordinate is 0 (c,) [rad or m].
-        mass: Mass of each body (c,) [kg].
-        center: Centre of mass in the body's own frame (c, 3) [m].
-        dof: n.
+        tree: The tree; what it has of bodies is cut to these.
     """
 
-    parent: Integers
-    prismatic: Integers
-    rotation: Floats
-    translation: Floats
-    coordinate: Integers
-    ratio: Floats
-    offset: Floats
-    mass: Floats
-    center: Floats
-    dof: int
+    tree: Tree
 
     @cached_property
     def core(self) -> Core:
         """These links as the compiled core takes them."""
-        return Core.make(**{name: getattr(self, name) for name in _BODY}, dof=self.dof)
+        return Core.make(**{name: getattr(self.tree, name) for name in _BODY}, dof=self.tree.armature.size)
 
     @cached_property
     def key(self) -> bytes:
         """A key that is equal for equal links."""
-        return b"".join(getattr(self, name).tobytes() for name in _BODY)
-
-
-_BODY = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio", "offset", "mass", "center")
+        return b"".join(getattr(self.tree, name).tobytes() for name in _BODY)
 
 
 def links(tree: Tree, body: int | None = None) -> Links:
     """The bodies from the root to ``body``, or all bodies if left out."""
     if body is None:
-        members = np.arange(tree.parent.size)
-    else:
-        path = [body]
-        while tree.parent[path[-1]] >= 0:
-            path.append(int(tree.parent[path[-1]]))
-        members = np.array(path[::-1])
-    index = {int(b): k for k, b in enumerate(members)}
-    parent = np.array([index.get(int(tree.parent[b]), -1) for b in members], dtype=np.int64)
-    return Links(parent, **{name: getattr(tree, name)[members] for name in _BODY[1:]}, dof=tree.armature.size)
+        return Links(tree)
+    path = [body]
+    while tree.parent[path[-1]] >= 0:
+        path.append(int(tree.parent[path[-1]]))
+    own = {name: getattr(tree, name)[path[::-1]] for name in _BODY[1:]}
+    return Links(tree._replace(parent=np.arange(-1, len(path) - 1), **own))
 
 
 def place_on_body(tree: Tree, q: Floats, body: int, point: Floats) -> Floats:
@@ -116,8 +96,10 @@ class FrameKinematics(Frozen):
 
 
 def frame_kinematics(robot: Robot, frame: str) -> FrameKinematics:
-    """A frame by its name."""
-    body, rotation, translation = frame_on_body(robot.free_model, frame, robot.name)
+    """A frame by its name; an InputError if no joint moves it."""
+    body, rotation, translation = place_of_frame(robot.free_model, frame, robot.name)
+    if body < 0:
+        raise InputError(f"frame {frame!r} of robot {robot.name!r} is fixed to the base: no joint moves it")
     return FrameKinematics(frame, links(robot.tree, body), rotation, translation)
 
 

@@ -169,18 +169,16 @@ def _with_rotors(robot: Robot, armature: JointValues) -> Robot:
     model, names = robot.free_model, robot.joint_names
     indices = [model.joints[model.getJointId(name)].idx_v for name in names]
     armatures = np.array(model.armature)[indices]
-    if isinstance(armature, Mapping):
-        for name, number in armature.items():
-            value = finite(f"armature[{name!r}]", number)
-            if name in names:
-                armatures[names.index(name)] = value
-            elif name not in robot.locked:
-                raise UnknownJoint(str(name), names, "armature")
-    else:
-        armatures = broadcast_array("armature", armature, len(names))
-    if (armatures < 0.0).any():
-        worst = int(np.argmin(armatures))
-        raise InputError(f"armature of joint {names[worst]!r} must be >= 0 [kg m^2 or kg], got {armatures[worst]:g}")
+    if not isinstance(armature, Mapping):
+        armature = dict(zip(names, broadcast_array("armature", armature, len(names)), strict=True))
+    for name, number in armature.items():
+        value = finite(f"armature[{name!r}]", number)
+        if value < 0.0:
+            raise InputError(f"armature of joint {name!r} must be >= 0 [kg m^2 or kg], got {value:g}")
+        if name in names:
+            armatures[names.index(name)] = value
+        elif name not in robot.locked:
+            raise UnknownJoint(str(name), names, "armature")
     values = np.array(model.armature)
     values[indices] = armatures
     model.armature = values

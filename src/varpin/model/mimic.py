@@ -4,7 +4,6 @@ Pinocchio computes no RNEA derivatives of a model with mimic joints. varpin ther
 followers are tied to their leaders, and a free one in which every joint is independent.
 """
 
-import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -70,21 +69,10 @@ def _to_free_leader(tie: Tie, ties: dict[int, Tie], model: pin.Model) -> Tie:
     """The tie to the free joint at the end of the chain of leaders."""
     for _ in range(len(ties) + 1):
         if tie.leader not in ties:
-            _require_usable(tie, model)
             return tie
         after = ties[tie.leader]
         tie = Tie(tie.follower, after.leader, tie.ratio * after.ratio, tie.ratio * after.offset + tie.offset)
     raise RobotError(f"joint {model.names[tie.follower]!r} mimics itself through a loop of mimic joints")
-
-
-def _require_usable(tie: Tie, model: pin.Model) -> None:
-    """Refuse a tie whose offset, or squared ratio (the factor of inertias), is not finite."""
-    if math.isfinite(tie.ratio * tie.ratio) and math.isfinite(tie.offset):
-        return
-    raise RobotError(
-        f"joint {model.names[tie.follower]!r} mimics {model.names[tie.leader]!r} with multiplier {tie.ratio:g} and "
-        f"offset {tie.offset:g}: the offset and the square of the multiplier must be finite"
-    )
 
 
 def tied_model(model: pin.Model, ties: Sequence[Tie]) -> pin.Model:
@@ -154,8 +142,7 @@ def of_mimics(model: pin.Model) -> tuple[tuple[Tie, ...], dict[int, pin.JointMod
         subspace = np.asarray(data.S, dtype=float).reshape(6)
         slides = bool(subspace[:3].any())
         axis = (subspace[:3] if slides else subspace[3:]) / follower.scaling
-        ties.append(tie := Tie(joint, leader, float(follower.scaling), float(follower.offset)))
-        _require_usable(tie, model)
+        ties.append(Tie(joint, leader, float(follower.scaling), float(follower.offset)))
         free[joint] = pin.JointModelPrismaticUnaligned(axis) if slides else pin.JointModelRevoluteUnaligned(axis)
     return tuple(ties), free
 

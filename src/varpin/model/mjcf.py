@@ -42,15 +42,10 @@ _PLATE = 5e-4
 
 def is_mjcf(path: Path) -> bool:
     """Whether a file is an MJCF by its root element; only ``.xml`` and ``.mjcf`` files are opened."""
-    return path.suffix.lower() in (".xml", ".mjcf") and root_tag(path) in ("mujoco", "mujocoinclude")
-
-
-def root_tag(path: Path) -> str:
-    """Tag of the root element of a file; empty if the file is not well-formed XML."""
     try:
-        return read_xml(path).tag
+        return path.suffix.lower() in (".xml", ".mjcf") and read_xml(path).tag in ("mujoco", "mujocoinclude")
     except RobotError:
-        return ""
+        return False
 
 
 def read_mjcf(path: Path) -> tuple[pin.Model, tuple[str, ...], tuple[Equality, ...]]:

@@ -96,17 +96,16 @@ class Robot(Frozen):
     def _repr_html_(self) -> str:
         lower, upper = self.position_limits
         columns = zip(self.joint_names, lower, upper, self.velocity_limit, self.effort_limit, strict=True)
+        tied = (self.free_model.names[tie.follower] for tie in self.ties)
+        loops = (f"{a} on {b}" for a, b in self.loops)
         rows: list[tuple[str, object]] = [
             ("joints that move", self.dof),
             ("mass that moves [kg]", float(self.tree.mass.sum())),
+            ("locked", markup.listed(self.locked)),
+            ("tied to others", markup.listed(tied)),
+            ("loops for a scene to close", markup.listed(loops)),
+            ("end effector", self.end_effector),
         ]
-        if self.locked:
-            rows.append(("locked", markup.listed(self.locked)))
-        if self.ties:
-            rows.append(("tied to others", markup.listed(self.free_model.names[tie.follower] for tie in self.ties)))
-        if self.loops:
-            rows.append(("loops for a scene to close", markup.listed(f"{a} on {b}" for a, b in self.loops)))
-        rows.append(("end effector", self.end_effector))
         head = ("joint", "lower [rad or m]", "upper", "velocity [1/s]", "torque [N m or N]")
         return markup.facts(
             f"Robot {self.name}", rows, markup.table(head, [(name, *map(float, row)) for name, *row in columns])
@@ -165,17 +164,13 @@ class Robot(Frozen):
         """Names of the postures that :meth:`posture` knows."""
         return tuple(dict.fromkeys(state.name for state in self.group_states))
 
-    def posture(self, name: str, *, group: str | None = None, others: JointValues = 0.0) -> Floats:
+    def posture(self, name: str, *, others: JointValues = 0.0) -> Floats:
         """A posture of the robot's SRDF file (its ``group_state``), or a reference configuration of its model.
 
         Joints of the posture that are not coordinates of the robot (locked, mimic or absent joints) are ignored.
 
-        Main args:
-            name: Name of the posture: ``"home"``; or ``"arm/home"``, short for ``group="arm"``.
-
-        Other Args:
-            group: The joint group to take the posture of, where several groups have one of this name. If left out, the
-                postures of all these groups together.
+        Args:
+            name: Name of the posture: ``"home"``, of all joint groups that have one; or ``"arm/home"``, of one group.
             others: Positions of the joints that the posture does not set: a number, (n,), or by joint name [rad or m].
 
         Returns:
@@ -183,26 +178,20 @@ class Robot(Frozen):
 
         Raises:
             UnknownPosture: There is no posture of this name; the message lists the names.
-            InputError: The group has no posture of this name, or groups give a joint two positions.
+            InputError: Groups give a joint two positions.
             UnknownJoint: ``others`` names a joint that the robot does not have.
         """
         q = joint_array("others", others, self.joint_names, uniform=True)
-        found = [state for state in self.group_states if state.name == name]
-        first, slash, rest = str(name).partition("/")
-        if not found and slash and group is None:
-            name, group = rest, first
-            found = [state for state in self.group_states if state.name == name]
+        found = [state for state in self.group_states if name in (state.name, f"{state.group}/{state.name}")]
         if not found:
             raise UnknownPosture(name, self.postures, self.name)
-        groups = ", ".join(state.group for state in found)
-        if group is not None and not (found := [state for state in found if state.group == group]):
-            raise InputError(f"group {group!r} has no posture {name!r}; the groups {groups} have one")
         positions: dict[str, float] = {}
         for joint, position in (entry for state in found for entry in state.positions):
             if joint in self.joint_names:
                 if positions.setdefault(joint, position) != position:
+                    groups = ", ".join(repr(f"{state.group}/{state.name}") for state in found)
                     raise InputError(
-                        f"the postures {name!r} give joint {joint!r} two positions: choose a group= of {groups}"
+                        f"the postures {name!r} give joint {joint!r} two positions: choose one of {groups}"
                     )
                 q[self.coordinate(joint)] = position
         return q

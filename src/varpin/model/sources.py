@@ -16,7 +16,7 @@ from varpin.errors import FileError, InputError, RobotError, RobotNotFound
 from varpin.model import example_robot_data, robot_descriptions
 from varpin.model.equalities import Closure
 from varpin.model.mimic import JOINT_PARAMETERS, POSITION_LIMITS, depth_first, joint_frames, of_mimics, ties_of
-from varpin.model.mjcf import is_mjcf, read_mjcf, root_tag
+from varpin.model.mjcf import is_mjcf, read_mjcf
 from varpin.model.packages import Files, Packages
 from varpin.model.robot import Robot
 from varpin.model.srdf import beside, read_srdf, reference_postures
@@ -138,11 +138,6 @@ def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) ->
     _check_model(model, name)
     # Copies, so that later changes of the user's model do not change the robot.
     shapes = visuals.copy() if visuals is not None else None
-    for shape in shapes.geometryObjects if shapes is not None else ():
-        if shape.parentJoint >= model.njoints:
-            raise RobotError(
-                f"shape {shape.name!r} has the parent joint {shape.parentJoint}, which model {name!r} does not have"
-            )
     ties, kinds = of_mimics(model)
     robot = Robot(name, model.copy(), ties, visuals=shapes, group_states=reference_postures(model))
     order = depth_first(model, ties)
@@ -181,10 +176,6 @@ def _of_files(files: Files, *, tied: bool) -> Robot:
         loops = tuple((each.a.body, each.b.body) for each in equalities if isinstance(each, Closure))
         robot = _of_model(model, files.name, None)
         return robot.changed(mjcf=path, remarks=remarks, loops=loops, equalities=equalities)
-    elif path.suffix == ".sdf" or (path.suffix in (".xml", ".world") and root_tag(path) == "sdf"):
-        raise RobotError(
-            f"{path} is an SDF file, which Pinocchio's package on PyPI cannot read; convert it to a URDF or an MJCF"
-        )
     urdf = read_urdf(path, text)
     ties, alone = ties_of(urdf.mimics, urdf.model) if tied else ((), ())
     robot = Robot(

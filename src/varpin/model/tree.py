@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats, Integers
 from varpin.core import Mechanism
 from varpin.core.arrays import ConstraintRows, Tree
-from varpin.errors import InputError, RobotError, UnknownFrame, UnsupportedJoint
+from varpin.errors import RobotError, UnknownFrame, UnsupportedJoint
 from varpin.model.mimic import Tie
 
 
@@ -115,22 +115,14 @@ def frame_index(model: pin.Model, frame: str, robot: str) -> int:
     return next((index for index in found if model.frames[index].type == pin.FrameType.BODY), found[0])
 
 
-def frame_on_body(model: pin.Model, frame: str, robot: str) -> tuple[int, Floats, Floats]:
-    """The body of the flat tree that carries a frame, and the frame's rotation (3, 3) and position (3,) in it."""
-    found = model.frames[frame_index(model, frame, robot)]
-    joint = found.parentJoint
-    if joint == 0:
-        raise InputError(f"frame {frame!r} of robot {robot!r} is fixed to the base: no joint moves it")
-    turn = z_to(joint_axis(model, joint)[1])
-    return joint - 1, turn.T @ found.placement.rotation, turn.T @ found.placement.translation
-
-
 def place_of_frame(model: pin.Model, frame: str, robot: str) -> tuple[int, Floats, Floats]:
-    """As :func:`frame_on_body`; for a frame that is fixed to the base, -1 and its placement in the world."""
+    """The body of the flat tree that carries a frame, -1 for the world, and its rotation and position in that body."""
     found = model.frames[frame_index(model, frame, robot)]
-    if found.parentJoint == 0:
-        return -1, found.placement.rotation.copy(), found.placement.translation.copy()
-    return frame_on_body(model, frame, robot)
+    joint, R, at = found.parentJoint, found.placement.rotation.copy(), found.placement.translation.copy()
+    if joint == 0:
+        return -1, R, at
+    turn = z_to(joint_axis(model, joint)[1])
+    return joint - 1, turn.T @ R, turn.T @ at
 
 
 def coordinate_armature(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...]) -> Floats:

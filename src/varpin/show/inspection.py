@@ -136,9 +136,8 @@ class RobotReport(Frozen):
         total_mass: Mass of all moving links [kg].
         q: Configuration of the report (n,) [rad or m].
         v: Velocity of the report (n,) [rad/s or m/s].
-        condition: Condition number of M(q); it mixes units if there are prismatic joints. Infinite if singular.
-        scaled_condition: Condition number of M(q) with rows and columns scaled to a unit diagonal, which does not
-            depend on units. Infinite if singular.
+        condition: Condition number of M(q) with rows and columns scaled to a unit diagonal, which does not depend on
+            units. Infinite if M is singular.
         largest_step: Largest dt [s] whose step the midpoint integrator's branch guard accepts around (q, v); infinite
             where no direction is unstable, None where M is singular. It is not a measure of accuracy.
         branch_margin: The guard's margin, for which ``largest_step`` holds.
@@ -154,7 +153,6 @@ class RobotReport(Frozen):
     q: Floats
     v: Floats
     condition: float
-    scaled_condition: float
     largest_step: float | None
     branch_margin: float
     warnings: tuple[str, ...]
@@ -276,14 +274,14 @@ def inspect_robot(
     if not all(np.isfinite(array).all() for array in (jet.Lvv, jet.Lqq)):
         raise RobotError(f"robot {robot.name!r} cannot be inspected: its mass matrix or its derivatives are not finite")
     margin = Guard().branch_margin
-    condition, scaled = _condition_numbers(jet.Lvv)
+    condition = _condition_number(jet.Lvv)
     links, (shapes, unread) = _links(robot), readable_geometry(robot) if meshes else (pin.GeometryModel(), {})
     warnings = [
         *(*robot.faults, *robot.remarks, *robot.notes, *robot.limit_remarks()),
         *one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links, shapes))),
         *_mesh_warnings(robot, shapes),
         *dict.fromkeys(what for _, what in unread.values()),
-        *_matrix_warnings(robot, scaled),
+        *_matrix_warnings(robot, condition),
         *one_of_each(_limit_warnings(robot, configuration)),
         *_unused(robot),
     ]
@@ -297,22 +295,19 @@ def inspect_robot(
         q=configuration,
         v=velocity,
         condition=condition,
-        scaled_condition=scaled,
-        largest_step=largest_step(jet.Lvv, jet.Lqq, margin) if np.isfinite(scaled) else None,
+        largest_step=largest_step(jet.Lvv, jet.Lqq, margin) if np.isfinite(condition) else None,
         branch_margin=margin,
         warnings=tuple(warnings),
     )
 
 
-def _condition_numbers(M: Floats) -> tuple[float, float]:
-    """Condition number of M, and of M with a unit diagonal; both infinite where M is singular in double precision."""
+def _condition_number(M: Floats) -> float:
+    """Condition number of M with a unit diagonal; infinite where M is singular in double precision."""
     if not (np.diag(M) > 0.0).all():
-        return np.inf, np.inf
+        return np.inf
     scale = np.sqrt(np.diag(M))
-    scaled = np.linalg.eigvalsh(M / np.outer(scale, scale))
-    if scaled[0] <= len(M) * np.finfo(float).eps:
-        return np.inf, np.inf
-    return float(np.linalg.cond(M)), float(scaled[-1] / scaled[0])
+    values = np.linalg.eigvalsh(M / np.outer(scale, scale))
+    return float(values[-1] / values[0]) if values[0] > len(M) * np.finfo(float).eps else np.inf
 
 
 def _joints(robot: Robot) -> tuple[JointReport, ...]:
@@ -440,16 +435,16 @@ def _mesh_warnings(robot: Robot, shapes: pin.GeometryModel) -> Iterator[str]:
         )
 
 
-def _matrix_warnings(robot: Robot, scaled: float) -> Iterator[str]:
+def _matrix_warnings(robot: Robot, condition: float) -> Iterator[str]:
     try:
         check_inertia(robot)
     except SingularMassMatrix as error:
         yield str(error)
         return
-    if scaled > CONDITION:
+    if condition > CONDITION:
         yield (
-            f"the mass matrix is ill-conditioned: with a unit diagonal its condition number is {scaled:.1e}, so "
-            f"accelerations lose {int(np.log10(scaled))} digits"
+            f"the mass matrix is ill-conditioned: with a unit diagonal its condition number is {condition:.1e}, so "
+            f"accelerations lose {int(np.log10(condition))} digits"
         )
 
 

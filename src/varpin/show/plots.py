@@ -7,7 +7,7 @@ Figures are made without pyplot: nothing is shown, registered or configured glob
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import cycle, islice
+from itertools import cycle, islice, product
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -33,8 +33,6 @@ Motion: TypeAlias = "Trajectory | Solution | MpcRun"
 # Okabe and Ito's palette for colour-blind readers, without its yellow, which is faint on white.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 DASHES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)), (0, (9, 3)))
-# Line widths: the second is for lines beyond all combinations of colours and dashes.
-_WIDTHS = (1.4, 0.7)
 # Entry of the legend for the limits, and the share of the motion's range within which limits are drawn.
 _LIMITS, _NEAR = "limits", 0.3
 # Rows of a column of the legend.
@@ -209,14 +207,13 @@ def plot_trajectory(
 
 
 def _share_legend(figure: Figure, panels: NDArray[Any]) -> None:
-    """One legend for all panels with the lines of the first; that of one panel would push the others apart."""
-    entries = [dict(zip(*reversed(panel.get_legend_handles_labels()), strict=True)) for panel in panels]
-    shared = dict(entries[0])
-    for panel, own in zip(panels, entries, strict=True):
-        legend = panel.get_legend()
-        if legend is not None and own.keys() - {_LIMITS} == entries[0].keys() - {_LIMITS}:
-            shared |= own
-            legend.remove()
+    """One legend for all panels; that of one panel would push the others apart."""
+    shared: dict[str, Any] = {}
+    for panel in panels:
+        handles, names = panel.get_legend_handles_labels()
+        shared |= {name: handle for name, handle in zip(names, handles, strict=True) if name not in shared}
+        if panel.get_legend() is not None:
+            panel.get_legend().remove()
     if len(shared) > 1:
         figure.legend(shared.values(), shared.keys(), loc="outside right upper", frameon=False, fontsize="small")
 
@@ -390,14 +387,9 @@ def _require_motion(given: object, robot: Robot | None) -> Trajectory:
 
 
 def _styles(lines: int) -> list[dict[str, Any]]:
-    """Distinct line styles: all colours, then all colours dashed, and so on, then all of these thinner."""
-    kinds = (
-        {"color": color, "linestyle": dash, "linewidth": width}
-        for width in cycle(_WIDTHS)
-        for dash in DASHES
-        for color in COLORS
-    )
-    return list(islice(kinds, lines))
+    """Distinct line styles: all colours, then all colours dashed, and so on."""
+    kinds = cycle(product(DASHES, COLORS))
+    return [{"color": color, "linestyle": dash, "linewidth": 1.4} for dash, color in islice(kinds, lines)]
 
 
 def _finish(axes: Axes, trajectory: Trajectory, label: str) -> None:

@@ -193,15 +193,8 @@ def in_parts(values: Floats, times: Times, parts: int, at: Times) -> Floats:
 def in_parts_of_steps(scene: Scene, u: Floats, q: Floats, v: Floats, dt: float, parts: int) -> Floats:
     """Controls (N * parts, m) of steps divided into ``parts`` equal parts, for the same prescribed motion.
 
-    Forces stay constant; positions and velocities of kinematic inputs follow the lines and cubics of their steps.
-
-    Args:
-        scene: The scene.
-        u: Controls of the whole steps (N, m).
-        q: Configurations at the start of the steps (N, n) [rad or m].
-        v: Velocities there (N, n) [rad/s or m/s], for cubics.
-        dt: Length of a whole step [s].
-        parts: Number of parts.
+    Forces u (N, m) stay constant; positions and velocities of kinematic inputs follow the lines and cubics of their
+    steps of ``dt`` [s], from q and v (N, n) at their starts.
     """
     fine = np.repeat(u, parts, axis=0)
     share = np.arange(1, parts + 1) / parts

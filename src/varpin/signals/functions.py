@@ -58,11 +58,7 @@ def require_law(law: ControlLaw) -> None:
 
 
 def decision(law: ControlLaw, scene: Scene, step: int, time: float, q: Floats, v: Floats) -> Floats:
-    """The control (1, m) of the period that begins with a step, at its time [s] and state (n,), (n,).
-
-    Raises:
-        ControlError: The law failed.
-    """
+    """The control (1, m) of the period that begins with a step, at its time [s]; a ControlError if the law failed."""
     read = _reader("controls(t, q, v)", scene)
     return _called("controls(t, q, v)", lambda: law(time, q.copy(), v.copy()), read, step, time)[None]
 
@@ -106,15 +102,7 @@ class Moments:
 
 
 def moments_of(values: Values, first: int, count: int, dt: float, breaks: Sequence[float] = ()) -> Moments:
-    """The moments of a function over ``count`` steps of ``dt`` [s] from step ``first`` on.
-
-    Args:
-        values: The function.
-        first: The first step.
-        count: Their number.
-        dt: Length of a step [s].
-        breaks: Times at which the function jumps or has kinks [s].
-    """
+    """The moments over ``count`` steps of ``dt`` [s] from ``first`` on of a function that jumps at ``breaks`` [s]."""
     step, begin, width = _panels(first, count, dt, np.array(breaks, dtype=np.float64))
     total, square, spent = np.zeros((0, 0, 0)), np.zeros((0, 0)), 0
     extremes = np.zeros((2, 0, 0))
@@ -185,10 +173,7 @@ def _panels(first: int, count: int, dt: float, breaks: Floats) -> tuple[Integers
 
 @functools.cache
 def _rule(points: int) -> tuple[Floats, Floats, Floats, Floats]:
-    """Gauss-Legendre points on a unit panel between its ends (p + 2,), their weights (p,), and two matrices.
-
-    The matrices lead to the Legendre series (p, p), and to its values at the ends (2, p).
-    """
+    """Points of a panel with its ends (p + 2,), weights (p,), and matrices to the series (p, p) and its ends (2, p)."""
     x, w = np.polynomial.legendre.leggauss(points)
     degrees = np.arange(points)
     to_series = (0.5 * (2.0 * degrees + 1.0))[:, None] * (legvander(x, points - 1) * w[:, None]).T
@@ -217,11 +202,7 @@ class Sampled(OpenLoop):
         return self.parts[0]
 
     def moments(self, first: int, last: int) -> Moments:
-        """The moments over steps first .. last, which begin at a step that is known or the next one.
-
-        Raises:
-            ControlError: The function failed.
-        """
+        """The moments over steps first .. last, of which the first is known or the next; a ControlError if f failed."""
         if last > self.done:
             values = functools.partial(_values, self, self.scene)
             self.parts.append(moments_of(values, self.done, last - self.done, self.dt, self.breaks))
@@ -233,10 +214,7 @@ class Sampled(OpenLoop):
     def commands(self, first: int, steps: int, times: Times) -> Commands:
         """The controls of ``steps`` steps from ``first`` on, for stages at ``times`` of a step.
 
-        Kinematic inputs move to the values at the ends of the steps.
-
-        Raises:
-            ControlError: The function failed.
+        Kinematic inputs move to the values at the ends of the steps. Raises a ControlError if the function failed.
         """
         found = self.moments(first, first + steps)
         commands = changing(found.at(times), times) if times else open_loop(found.mean)
@@ -272,11 +250,7 @@ def left_by_stages(controls: Sampled, stages: int) -> float:
 
 
 def _values(controls: OpenLoop, scene: Scene, times: Floats, steps: Integers) -> Floats:
-    """Controls (K, m) from a function of time at times (K,) [s] within ``steps`` (K,).
-
-    Raises:
-        ControlError: The function raised, or returned something else.
-    """
+    """Controls (K, m) from a function of time at times (K,) [s] within ``steps`` (K,); a ControlError if it failed."""
     f: Callable[..., Any] = controls.f
     at, m = list(zip(steps.tolist(), times.tolist(), strict=True)), scene.controls
     if not controls.vectorized:
@@ -321,11 +295,7 @@ def _called(
     step: int,
     time: float,
 ) -> Floats:
-    """What a user's function returns, as ``read`` takes it.
-
-    Raises:
-        ControlError: The function raised, or returned something else.
-    """
+    """What a user's function returns, as ``read`` takes it; a ControlError if it raised, or returned something else."""
     try:
         value = call()
     except Exception as error:

@@ -361,10 +361,7 @@ def _cure(
     hold: int,
     excess: float,
 ) -> str:
-    """What reduces an error that exceeds its threshold by a factor ``excess``.
-
-    A policy on (q, v) takes no other method. A law with a period of ``hold`` steps, and a policy, keep their periods.
-    """
+    """What reduces an error that exceeds its threshold by a factor ``excess``; laws and policies keep their periods."""
     q, v, most = trajectory.q, trajectory.v, _RINGS / trajectory.dt
     contact = contact_rate(scene, q, v, trajectory.dt)
     damped_by_others = not (integrator.l_stable or scene.constraints or contact > most)
@@ -395,11 +392,7 @@ def _cure(
 
 
 def short_forces(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """A warning if stages miss the impulse of a custom force along the cubics through the nodes.
-
-    Raises:
-        CustomForceError: The function fails between the nodes.
-    """
+    """A warning if stages miss the impulse of a custom force along the cubics through the nodes."""
     force = scene.custom
     if force is None or not trajectory.steps:
         return ()

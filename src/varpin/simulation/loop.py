@@ -67,13 +67,7 @@ class Loop:
 
 
 def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[Finding, ...]:
-    """The warning of a control loop that is unstable at its period; empty if it is stable, or nothing is known.
-
-    Args:
-        scene: The scene.
-        trajectory: A motion under feedback.
-        hold: The period of the feedback in steps.
-    """
+    """The warning of a loop that is unstable at its period of ``hold`` steps; empty if stable, or nothing is known."""
     period, (at, x, u) = hold * trajectory.dt, decisions(trajectory, hold)
     if len(at) < 3 or not np.ptp(u, axis=0).any():
         return ()

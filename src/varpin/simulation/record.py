@@ -12,7 +12,7 @@ import numpy as np
 from varpin._version import __version__
 from varpin.arrays import Floats
 from varpin.core.arrays import Commands
-from varpin.errors import ControlError, StepError, VarpinError
+from varpin.errors import ControlError, InputError, StepError, VarpinError
 from varpin.integrators import Integrator, Segment
 from varpin.integrators.base import Failure, join
 from varpin.mechanics.constraints import CustomConstraintError
@@ -21,12 +21,17 @@ from varpin.mechanics.scene import Scene
 from varpin.signals.commands import as_moved, in_parts_of_steps, lines, open_loop, rows, steps_of, with_ends
 from varpin.signals.controls import Controls
 from varpin.signals.functions import ControlLaw, Sampled, decision
-from varpin.simulation.failures import ConstraintError, ForceError
+from varpin.simulation.failures import ConstraintError, ForceError, NoiseError
 from varpin.support.checks import told_motion
 from varpin.trajectory import Nodes, Trajectory
 
 # Number of segments from which on they are joined into one.
 _PARTS = 256
+# The error of a step for that of a user's function; of noise for any other.
+_OF_STEPS: dict[type[InputError], type[StepError]] = {
+    CustomForceError: ForceError,
+    CustomConstraintError: ConstraintError,
+}
 
 Progress = Callable[[int, int], None] | Callable[[int, int, Nodes], None]
 # Longest time between two calls of a function that gets the motion [s], except within a chunk of steps.
@@ -99,19 +104,34 @@ class MotionRecord:
         self._parts: list[Segment] = []
         self._within: list[Floats] = []
 
-    def add(self, segment: Segment, within: Floats) -> None:
-        """Append steps, with the controls at their stages (N, s, m)."""
+    def advance(
+        self, state: object, controls: Controls | ControlLaw, commands: Commands, most: int, steps: int
+    ) -> Segment:
+        """Append about ``most`` steps of ``steps`` in all; a StepError with the motion so far if a function failed."""
+        try:
+            block = next_block(controls, commands, self, most, steps - self.steps)
+        except ControlError as error:
+            raise error.after(self.trajectory()) from error.__cause__
+        drawn = self.dw[None, self.steps : self.steps + steps_of(block)] if len(self.dw) else self.dw[None, :0][:0]
+        try:
+            (segment,) = self.integrator.rollout(self.scene, state, block, drawn, self.dt)
+        except (CustomForceError, CustomConstraintError, InputError) as error:
+            now = self.trajectory()
+            kind = _OF_STEPS.get(type(error), NoiseError)
+            cause = error.__cause__ if kind is NoiseError else error
+            raise kind(now.steps, float(now.t[-1]), str(error), now) from cause
         if not len(segment.q):
-            return
+            return segment
         self.steps += len(segment.q)
         self.last = segment
         self._parts.append(segment)
-        if len(within):
-            self._within.append(within[: len(segment.q)])
+        if len(block.within):
+            self._within.append(block.within[: len(segment.q)])
         # A segment of one step takes many times the memory of its numbers.
         if len(self._parts) == _PARTS:
             self._joined.append(join(self._parts))
             self._parts = []
+        return segment
 
     def trajectory(self) -> Trajectory:
         """The motion so far."""
@@ -140,17 +160,10 @@ def trajectory_of(
     within: Floats | None,
     on: Commands | None = None,
 ) -> Trajectory:
-    """The motion from a first node through consecutive segments.
+    """The motion from a first node through consecutive segments; increments ``dw`` (N, k), None for zeros.
 
-    Args:
-        scene: The scene.
-        integrator: The integrator.
-        dt: Time step [s].
-        first: The first node.
-        parts: The segments.
-        dw: Increments (N, k) [s^0.5]; None for zeros.
-        within: Controls at the stages (N, s, m); None for controls that are constant over each step.
-        on: The commands of the whole motion, where its controls are linear between nodes.
+    ``within`` are the controls at the stages (N, s, m), None for constant ones; ``on`` the commands of the whole motion,
+    where its controls are linear between nodes.
     """
     steps = join(parts) if len(parts) > 1 else parts[0] if parts else first.part(0)
     N = len(steps.u)
@@ -184,13 +197,6 @@ def trajectory_of(
     )
 
 
-def function_error(error: CustomForceError | CustomConstraintError, record: MotionRecord, where: str = "") -> StepError:
-    """The error of a user's function that failed in the step after the record."""
-    now = record.trajectory()
-    kind = ForceError if isinstance(error, CustomForceError) else ConstraintError
-    return kind(now.steps, float(now.t[-1]), f"{where}{error}", now)
-
-
 def located(
     scene: Scene,
     integrator: Integrator,
@@ -208,16 +214,12 @@ def located(
     state, (first,) = integrator.start(scene, start[0][None], start[1][None])
     dw = np.zeros((0, scene.processes)) if increments is None else increments
     record = MotionRecord(scene, integrator, dt, dw, first, commands if len(commands.stage_times) else None)
-    while record.steps < steps_of(commands):
-        block = next_command(commands, record)
-        drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
-        try:
-            (segment,) = integrator.rollout(scene, state, block, drawn, dt)
-        except (CustomForceError, CustomConstraintError) as found:
-            return function_error(found, record, where)
-        record.add(segment, block.within)
-        if segment.failure is not None:
-            break
+    steps = steps_of(commands)
+    try:
+        while record.steps < steps and record.advance(state, None, commands, 1, steps).failure is None:
+            pass
+    except StepError as found:
+        return type(found)(found.step, found.time, f"{where}{found.problem}", found.trajectory)
     # The function did not fail this time: its result depends on more than its arguments.
     return error
 
@@ -240,17 +242,9 @@ def next_command(commands: Commands, record: MotionRecord) -> Commands:
 def next_block(
     controls: Controls | ControlLaw, commands: Commands, record: MotionRecord, most: int, left: int
 ) -> Commands:
-    """Commands of the next steps.
+    """Commands of about ``most`` next steps, whole intervals of held controls unless it is 1, of ``left`` in all.
 
-    Args:
-        controls: Of the motion.
-        commands: All commands, unless the controls are a function.
-        record: The steps so far.
-        most: About how many steps; whole intervals of held controls unless it is 1.
-        left: Steps to the end of the motion.
-
-    Raises:
-        ControlError: The function of the controls failed.
+    ``commands`` are those of the whole motion, unless the ``controls`` are a function: it may fail with a ControlError.
     """
     if callable(controls):
         decides = record.steps % commands.hold == 0
@@ -293,15 +287,10 @@ class Motions:
         increments: Floats | None = None,
         integrator: Integrator | None = None,
     ) -> tuple[Trajectory, Failure | None]:
-        """The motion, and the failure that stopped it early, if any. No argument is checked.
+        """The motion under commands of all its steps, unchecked, and the failure that stopped it early, if any.
 
-        Args:
-            commands: For all of its steps.
-            increments: Of its Wiener processes (N, k) [s^0.5]; left out, there is no noise.
-            integrator: The integrator with another guard; by default itself.
-
-        Raises:
-            ForceError: A function of a CustomForce failed; so for a ConstraintError.
+        ``increments`` are (N, k) [s^0.5], left out for no noise; ``integrator`` is the integrator with another guard. Raises
+        a ForceError or ConstraintError if a function failed.
         """
         drawn = np.zeros((0, 0, self.scene.processes)) if increments is None else increments[None]
         own = integrator or self.integrator

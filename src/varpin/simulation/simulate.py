@@ -9,31 +9,28 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.core.arrays import Commands
-from varpin.errors import ControlError, InputError
+from varpin.errors import InputError
 from varpin.finding import Finding, announce, ranked
-from varpin.integrators import Integrator, Segment
+from varpin.integrators import Integrator
 from varpin.integrators.base import Failure
-from varpin.mechanics.constraints import CustomConstraintError
-from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import wiener_increments
-from varpin.signals.commands import open_loop, steps_of
+from varpin.signals.commands import open_loop
 from varpin.signals.controls import Controls, commands_of
 from varpin.signals.functions import ControlLaw, Sampled, function_findings, require_law
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.check import check as checked
 from varpin.simulation.choice import usual_integrator
-from varpin.simulation.failures import Interrupted, NoiseError, StepFailure, named
+from varpin.simulation.failures import Interrupted, StepFailure, named
 from varpin.simulation.loop import unstable_loop
-from varpin.simulation.record import MotionRecord, Progress, Reporter, function_error, next_block
+from varpin.simulation.record import MotionRecord, Progress, Reporter
 from varpin.simulation.start import (
-    duration_for_tolerance,
     in_other_units,
     on_constraints,
     time_steps,
 )
 from varpin.simulation.tolerance import steps_for_tolerance
-from varpin.support.checks import JointValues, as_floats, count, flag, joint_array, require_memory
+from varpin.support.checks import JointValues, as_floats, count, flag, joint_array, positive, require_memory
 from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -139,7 +136,9 @@ def simulate(
     if scene.constraints:
         q0, v0, moved = on_constraints(scene, q0, v0)
     if tolerance is not None:
-        span = duration_for_tolerance(dt, steps, duration)
+        if dt is not None or steps is not None:
+            raise InputError("a tolerance chooses dt and steps: give duration and tolerance without them")
+        span = positive("duration", duration, "s")
         chosen = steps_for_tolerance(scene, q0, v0, span, tolerance, controls, integrator)
         integrator, steps, controls, accuracy, unmet, error = chosen
         dt = span / steps
@@ -218,10 +217,7 @@ def _roll(
     *,
     check: bool,
 ) -> bool:
-    """Integrate the steps of a motion into its record; False if Ctrl-C ended them.
-
-    ``hold`` is the period of the feedback in steps, None for none.
-    """
+    """Integrate the steps of a motion with feedback every ``hold`` steps; False if Ctrl-C ended them."""
     scene = record.scene
     # The cost of a sweep is linear in the number of joints, that of an elimination cubic.
     n = scene.robot.dof
@@ -232,36 +228,13 @@ def _roll(
         reporter.begin(record.last)
         while record.steps < steps:
             done = record.steps
-            try:
-                block = next_block(controls, commands, record, 1 if stepwise else chunk, steps - done)
-            except ControlError as error:
-                raise error.after(record.trajectory()) from error.__cause__
-            segment = _rolled_out(record, state, block)
-            record.add(segment, block.within)
+            segment = record.advance(state, controls, commands, 1 if stepwise else chunk, steps)
             if segment.failure is not None:
                 raise _step_failure(record, segment.failure, hold if check else None)
             reporter.add(segment, record.steps, due=done // chunk < record.steps // chunk)
     except KeyboardInterrupt:
         return False
     return True
-
-
-def _rolled_out(record: MotionRecord, state: object, block: Commands) -> Segment:
-    """The steps of a block.
-
-    Raises:
-        StepError: A user's function failed; the error has the motion so far.
-    """
-    dw, scene = record.dw, record.scene
-    drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
-    try:
-        (segment,) = record.integrator.rollout(scene, state, block, drawn, record.dt)
-    except (CustomForceError, CustomConstraintError) as error:
-        raise function_error(error, record) from error
-    except InputError as error:
-        now = record.trajectory()
-        raise NoiseError(now.steps, float(now.t[-1]), str(error), now) from error.__cause__
-    return segment
 
 
 def _step_failure(record: MotionRecord, failure: Failure, hold: int | None) -> StepFailure:

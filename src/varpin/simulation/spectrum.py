@@ -47,17 +47,10 @@ class Linearized(NamedTuple):
 
 
 def linearized(scene: Scene, q: Floats, v: Floats, forces: Floats, accelerated: Floats | None = None) -> Linearized:
-    """Linearize the motions at states q, v (K, n) under constant forces (K, n).
+    """Linearize the motions at states q, v (K, n) on the constraints, under constant forces (K, n).
 
-    Args:
-        scene: The scene.
-        q: Configurations (K, n), on the constraints [rad or m].
-        v: Velocities (K, n) that the constraints allow.
-        forces: (K, n) [N m or N].
-        accelerated: Accelerations of the joints (K, n), read for those with kinematic inputs; zero if left out.
-
-    Raises:
-        LinearizationError: A mass matrix is not positive definite, or a matrix of the constraints is not finite.
+    ``accelerated`` (K, n) are the accelerations of joints with kinematic inputs, zero if left out. Raises a
+    LinearizationError where a mass matrix is not positive definite, or a matrix of the constraints not finite.
     """
     a, aq, av, af = accelerations(scene, q, v, forces)
     if not scene.constraints:
@@ -183,17 +176,10 @@ def rate_at_rest(scene: Scene, q: Floats) -> float:
 
 
 def fastest_rate(scene: Scene, q: Floats, v: Floats, u: Floats, least: float) -> float:
-    """The fastest rate of damping along a motion [1/s]; 0 where none is faster than ``least``.
+    """The fastest rate of damping along a motion q, v (N + 1, n), u (N, m) [1/s]; 0 if none is faster than ``least``.
 
     It is looked for at some nodes, where dry friction is steepest, as joints come to rest or turn back, and in the
     stops that joints reach.
-
-    Args:
-        scene: The scene.
-        q: Configurations (N + 1, n) [rad or m].
-        v: Velocities (N + 1, n) [rad/s or m/s].
-        u: Controls (N, m).
-        least: [1/s].
     """
     if not scene.dissipates or not len(u):
         return 0.0

@@ -111,16 +111,3 @@ def finer(trajectory: Trajectory, parts: int) -> tuple[int, str]:
         if math.isclose(float(f"{dt:.4g}"), dt, rel_tol=_MULTIPLE):
             return more, f"dt = {dt:.4g} s"
     return parts, f"steps = {trajectory.steps * parts}"
-
-
-def duration_for_tolerance(dt: float | None, steps: int | None, duration: float | None) -> float:
-    """The duration of a motion with a tolerance [s]; refuses a given dt or number of steps."""
-    for name, value in (("dt", dt), ("steps", steps)):
-        if value is not None:
-            raise InputError(
-                f"{name} and tolerance do not go together: a tolerance chooses the steps; give duration and tolerance, "
-                f"or {name} without it"
-            )
-    if duration is None:
-        raise InputError("tolerance needs the duration of the motion [s]")
-    return positive("duration", duration, "s")

@@ -35,7 +35,7 @@ from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.signals.commands import held_in_parts, open_loop
 from varpin.signals.controls import Controls, commands_of, control_rows
-from varpin.signals.functions import ControlLaw, Sampled, require_law
+from varpin.signals.functions import ControlLaw, Sampled
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.check import closer, distance, repeated, short_forces
 from varpin.simulation.failures import ToleranceError
@@ -169,11 +169,7 @@ class Rung:
 
 
 class Ladder:
-    """Methods that are tried until one meets a wish.
-
-    Attributes:
-        rungs: The methods.
-    """
+    """Methods, ``rungs``, that are tried until one meets a wish."""
 
     def __init__(
         self,
@@ -183,15 +179,7 @@ class Ladder:
         rows: int,
         late: Callable[[], bool],
     ) -> None:
-        """A ladder without trials.
-
-        Args:
-            attempt: Tries a method with a number of steps.
-            integrators: The methods.
-            first: Number of steps of the first trials.
-            rows: All numbers of steps are multiples of it.
-            late: Whether no further trial may begin.
-        """
+        """A ladder that ``attempt``s integrators from ``first`` steps on, multiples of ``rows``, until ``late``."""
         self.attempt, self.late = attempt, late
         self.rungs = [Rung(member, first, rows) for member in integrators]
 
@@ -339,11 +327,7 @@ class _Search:
         return commands_of(self.scene, integrator, controls, steps, self.duration / steps)
 
     def attempt(self, integrator: Integrator, steps: int) -> Trial:
-        """A motion with its error, and the evaluations that it takes.
-
-        Raises:
-            VarpinError: A user's function has failed in all of many trials.
-        """
+        """A motion with its error and work; a VarpinError if a user's function has failed in all of many trials."""
         if steps > self.most:
             # Too long to run. Its cost is counted, which ends a search whose trials all fail in their first steps.
             self.evaluations += steps
@@ -387,16 +371,9 @@ def steps_for_tolerance(
     wanted: Controls | ControlLaw,
     integrator: Integrator | None,
 ) -> Chosen:
-    """Integrator, number of steps and controls for a tolerance, with the accuracy, the error and warnings.
+    """Integrator, number of steps and controls for a tolerance [rad or m], with the accuracy, the error and warnings.
 
-    Args:
-        scene: The scene, without noise.
-        q0: Initial configuration (n,) [rad or m].
-        v0: Initial velocity (n,) [rad/s or m/s].
-        duration: Of the motion [s].
-        tolerance: The largest error in q [rad or m].
-        wanted: The controls.
-        integrator: The only one to consider; None for all.
+    ``wanted`` are the controls, ``integrator`` is the only one to consider, None for all.
 
     Raises:
         InputError: The scene, the controls or the integrator are none that a tolerance can choose steps for.
@@ -404,7 +381,18 @@ def steps_for_tolerance(
         VarpinError: A user's function fails, or no integrator gets to the end.
     """
     wish = positive("tolerance", tolerance, "rad or m")
-    search = _Search(scene, q0, v0, duration, _require_choice(scene, wanted, integrator))
+    if scene.processes:
+        raise InputError(
+            "tolerance is of single motions without noise: leave the noise out of the scene, or give dt and steps"
+        )
+    if isinstance(integrator, Reference):
+        raise InputError("Reference chooses its own steps: its tolerance is rtol; give it dt and steps")
+    if callable(wanted):
+        raise InputError(
+            "a tolerance chooses the steps, in which a control law's period is: give dt and steps with a law, or a "
+            "varpin.LinearPolicy with a period, or a varpin.OpenLoop(f)"
+        )
+    search = _Search(scene, q0, v0, duration, wanted)
     floor = ROUNDING * max(1.0, float(np.abs(q0).max()))
     members = candidates(scene) if integrator is None else (integrator,)
     if integrator is None and isinstance(search.controls, LinearPolicy):
@@ -424,40 +412,14 @@ def steps_for_tolerance(
     record = Accuracy(
         wish, found.error, str(found.integrator), duration / found.steps, search.steps, search.evaluations
     )
-    told = () if record.met else (_unmet(record, floor),)
-    error = search.errors[str(found.integrator), found.steps]
-    return Chosen(found.integrator, found.steps, search.given(found.steps), record, told, error)
-
-
-def _unmet(record: Accuracy, floor: float) -> Finding:
-    """The warning that a tolerance is not met, with the cause."""
-    cause = f"rounding leaves {floor:.1e}" if record.tolerance < floor else "errors grow, or forces jump within steps"
+    cause = f"rounding leaves {floor:.1e}" if wish < floor else "errors grow, or forces jump within steps"
     text = (
-        f"tolerance = {record.tolerance:g} is not met: q is off by up to {record.error:.1e} with {record.integrator} "
+        f"tolerance = {wish:g} is not met: q is off by up to {record.error:.1e} with {record.integrator} "
         f"at dt = {record.dt:.3g} s ({cause})"
     )
-    return Finding("tolerance not met", text, value=record.error, unit="rad or m")
-
-
-def _require_choice(scene: Scene, controls: Controls | ControlLaw, integrator: Integrator | None) -> Controls:
-    """The controls, if a tolerance can choose steps for them.
-
-    Raises:
-        InputError: The scene has noise, the controls are a law, or the integrator chooses its own steps.
-    """
-    if scene.processes:
-        raise InputError(
-            "tolerance is of single motions without noise: leave the noise out of the scene, or give dt and steps"
-        )
-    if isinstance(integrator, Reference):
-        raise InputError("Reference chooses its own steps: its tolerance is rtol; give it dt and steps")
-    if callable(controls):
-        require_law(controls)
-        raise InputError(
-            "a control law is called once every period, in steps, and a tolerance chooses the steps: give dt and "
-            "steps with a law, or a varpin.LinearPolicy with a period, or a varpin.OpenLoop(f)"
-        )
-    return controls
+    told = () if record.met else (Finding("tolerance not met", text, value=record.error, unit="rad or m"),)
+    error = search.errors[str(found.integrator), found.steps]
+    return Chosen(found.integrator, found.steps, search.given(found.steps), record, told, error)
 
 
 def _intervals(policy: LinearPolicy, duration: float) -> int:

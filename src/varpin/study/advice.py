@@ -108,11 +108,6 @@ class Advice(Study[Choice]):
         """The choice."""
         return self.runs[0]
 
-    @property
-    def alternatives(self) -> tuple[Choice, ...]:
-        """The best of every other method that has one."""
-        return self.runs[1:]
-
     def __str__(self) -> str:
         return self.reason
 

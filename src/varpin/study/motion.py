@@ -43,13 +43,11 @@ class Outcome:
         motion: Up to the step that failed, if one did.
         failure: Why it did not get to the end; empty if it did.
         seconds: Wall time, the best of the repetitions [s].
-        spread: How far the middle one of the repetitions is above the best [s].
     """
 
     motion: Trajectory
     failure: str
     seconds: float
-    spread: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +99,8 @@ class Setting(Frozen):
 
     def run(self, integrator: Integrator, steps: int, *, repeats: int = 0, within: float = math.inf) -> Outcome:
         """The motion in ``steps`` steps, a multiple of R; arguments for the time as for :func:`fastest`."""
-        (motion, failure), seconds, spread = fastest(lambda: self._timed(integrator, steps), repeats, within)
-        return Outcome(motion, failure, seconds, spread)
+        (motion, failure), seconds = fastest(lambda: self._timed(integrator, steps), repeats, within)
+        return Outcome(motion, failure, seconds)
 
     def _timed(self, integrator: Integrator, steps: int) -> tuple[tuple[Trajectory, str], float]:
         """The motion once, why it failed, and its time [s]."""
@@ -127,16 +125,14 @@ class Setting(Frozen):
         return Trial(integrator, steps, off if math.isfinite(off) else math.inf, outcome.seconds, whole=whole)
 
 
-def fastest(
-    run: Callable[[], tuple[Result, float]], repeats: int, within: float = math.inf
-) -> tuple[Result, float, float]:
-    """The result, the time and the spread [s] of the fastest of several runs; each returns its result and time.
+def fastest(run: Callable[[], tuple[Result, float]], repeats: int, within: float = math.inf) -> tuple[Result, float]:
+    """The result and the time [s] of the fastest of several runs.
 
     The first run finds caches cold and a processor at rest: it does not count unless it is so long that this is
     nothing.
 
     Args:
-        run: Makes a run.
+        run: Makes a run; returns its result and time.
         repeats: How many count; 0 for the first alone.
         within: Time after which none is begun if one counts [s].
     """
@@ -144,8 +140,7 @@ def fastest(
     counted = [first] if not repeats or first[1] >= min(_LONG, within) else []
     while not counted or (len(counted) < repeats and time.perf_counter() - begin < within):
         counted.append(run())
-    result, seconds = min(counted, key=lambda done: done[1])
-    return result, seconds, float(np.median([done[1] for done in counted])) - seconds
+    return min(counted, key=lambda done: done[1])
 
 
 def integrators_of(scene: Scene, integrators: Sequence[Integrator] | None) -> tuple[Integrator, ...]:

@@ -29,7 +29,6 @@ class OptimalControlRun:
         steps: N.
         hold: Steps that share a control.
         seconds: Solve time, the best of the repetitions [s].
-        spread: Distance of the median of the repetitions from the best [s].
         iterations: Of the solver.
         planned_cost: What the solver believes, without noise.
         open_loop_cost: Of the controls on the continuous system.
@@ -45,7 +44,6 @@ class OptimalControlRun:
     steps: int
     hold: int
     seconds: float
-    spread: float
     iterations: int
     planned_cost: float
     open_loop_cost: float
@@ -53,11 +51,6 @@ class OptimalControlRun:
     accuracy: float
     status: str
     failure: str = ""
-
-    @property
-    def survived(self) -> bool:
-        """Whether there is a plan."""
-        return not self.failure
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -160,18 +153,18 @@ def _solved(problem: OptimalControlProblem, options: dict[str, Any]) -> tuple[So
 
 def _measured(problem: OptimalControlProblem, repeats: int, options: dict[str, Any]) -> OptimalControlRun:
     costs = dict.fromkeys(_COSTS, math.nan)
-    seconds, spread, iterations, status, failure = math.nan, 0.0, 0, "", ""
+    seconds, iterations, status, failure = math.nan, 0, "", ""
     # An error of one run, whatever it is, does not stop the others.
     try:
-        solution, best, scatter = fastest(lambda: _solved(problem, options), repeats)
+        solution, best = fastest(lambda: _solved(problem, options), repeats)
         truth = solution.verify()
         costs = {name: getattr(truth, name) for name in costs}
-        seconds, spread, iterations, status = best, scatter, solution.iterations, solution.status.name.lower()
+        seconds, iterations, status = best, solution.iterations, solution.status.name.lower()
     except InputError:
         raise
     except Exception as error:
         failure = f"{type(error).__name__}: {error}"
     return OptimalControlRun(
-        str(problem.integrator), problem.integrator.order, problem.dt, problem.steps, problem.hold, seconds, spread,
+        str(problem.integrator), problem.integrator.order, problem.dt, problem.steps, problem.hold, seconds,
         iterations, **costs, status=status, failure=failure,
     )  # fmt: skip

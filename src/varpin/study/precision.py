@@ -43,7 +43,6 @@ class WorkPrecisionRun:
         dt: Time step [s].
         steps: N.
         seconds: Wall time, the best of the repetitions [s].
-        spread: Distance of the median of the repetitions from the best [s].
         error: Largest error in q over the joints and the record's times [rad or m].
         energy_error: Largest distance from the initial energy over all nodes [J]; NaN unless energy is to stay.
         newton_iterations: In all.
@@ -58,7 +57,6 @@ class WorkPrecisionRun:
     dt: float
     steps: int
     seconds: float
-    spread: float
     error: float
     energy_error: float
     newton_iterations: int
@@ -66,11 +64,6 @@ class WorkPrecisionRun:
     sweeps: int
     split_steps: int
     failure: str = ""
-
-    @property
-    def survived(self) -> bool:
-        """Whether it got to the end."""
-        return not self.failure
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -252,7 +245,7 @@ def _samples(grids: Sequence[int], rows: int) -> int:
 def _measure(setting: Setting, exact: Floats, repeats: int, member: Integrator, steps: int) -> WorkPrecisionRun:
     """A run against the exact motion (K + 1, n)."""
     error = energy = seconds = math.nan
-    spread, counts, failure = 0.0, (0, 0, 0, 0), ""
+    counts, failure = (0, 0, 0, 0), ""
     # An error of one run, whatever it is, does not stop the others.
     try:
         outcome = setting.run(member, steps, repeats=repeats)
@@ -262,10 +255,10 @@ def _measure(setting: Setting, exact: Floats, repeats: int, member: Integrator, 
         failure, motion, own = outcome.failure, outcome.motion, outcome.motion.statistics
         counts = int(own.newton_iterations.sum()), int(own.jets.sum()), int(own.sweeps.sum()), own.split_steps
         if not failure:
-            seconds, spread = outcome.seconds, outcome.spread
+            seconds = outcome.seconds
             error = float(np.abs(motion.q[:: steps // (len(exact) - 1)] - exact).max())
             if setting.conservative:
                 energy = float(np.abs(motion.energy - motion.energy[0]).max())
     return WorkPrecisionRun(
-        str(member), member.order, setting.duration / steps, steps, seconds, spread, error, energy, *counts, failure
+        str(member), member.order, setting.duration / steps, steps, seconds, error, energy, *counts, failure
     )

@@ -24,7 +24,6 @@ Progress = Callable[[int, int], None]
 _HEADINGS = {
     "dt": "dt [s]",
     "seconds": "wall time [s]",
-    "spread": "spread of wall time [s]",
     "error": "error in q [rad or m]",
     "energy_error": "energy error [J]",
     "open_loop_cost": "true cost, open loop",

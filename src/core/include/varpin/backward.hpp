@@ -30,27 +30,7 @@ class BackwardPass {
   public:
     // Starts from the gradient (2n) and the Hessian (2n, 2n) of the terminal cost in x.
     BackwardPass(int dof, int controls, const double* terminal_gradient, const double* terminal_hessian)
-        : n(dof),
-          m(controls),
-          x(2 * dof),
-          size(2 * dof + controls),
-          W(size, size),
-          gradient(size),
-          costate(size),
-          scale(size),
-          step(dof, controls),
-          S(x, x),
-          T(size, size),
-          Q(size, size),
-          Qz(TiledMatrix::padded(size)),
-          Cz(TiledMatrix::padded(size)),
-          terms(size),
-          row(TiledMatrix::padded(size)),
-          Quu(m * m),
-          factors(m * m),
-          K(m, x),
-          Qux(m, x),
-          rest(m, x) {
+        : n(dof), m(controls), x(2 * dof), size(2 * dof + controls), step(dof, controls) {
         for (int i = 0; i < x; ++i) {
             gradient[i] = costate[i] = terminal_gradient[i];
             std::copy_n(terminal_hessian + i * x, x, W[i]);
@@ -250,25 +230,24 @@ class BackwardPass {
 
     int n, m, x, size;  // x = 2n states, and controls
     // The value: its Hessian, its gradient, and
-    TiledMatrix W;
+    TiledMatrix W{size, size};
     bool of_control = false;  // whether it has rows for a control
-    std::vector<double> gradient;
-    std::vector<double> costate;  // the gradient of the cost, without feedback and feed-forward
-    std::vector<double> scale;    // the rounding error of entry (i, j) of W is about eps scale_i scale_j
+    std::vector<double> gradient = zeros(size);
+    std::vector<double> costate = zeros(size);  // the gradient of the cost, without feedback and feed-forward
+    std::vector<double> scale = zeros(size);    // the rounding error of entry (i, j) of W is about eps scale_i scale_j
 
     // Work arrays of a step.
     LinearStep step;
-    TiledMatrix S;              // (x, x)
-    TiledMatrix T;              // (size, size) a product
-    TiledMatrix Q;              // (size, size); upper triangle alone until the decision, which has its rows in u
-    std::vector<double> Qz;     // (size) gradient, in whole tiles
-    std::vector<double> Cz;     // (size) gradient of the cost itself, in whole tiles
-    std::vector<double> terms;  // (size) of Q, as the scale of the value
-    std::vector<double> row;    // (size) in whole tiles
+    TiledMatrix S{x, x};
+    TiledMatrix T{size, size};  // a product
+    TiledMatrix Q{size, size};  // (size, size); upper triangle alone until the decision, which has its rows in u
+    std::vector<double> Qz = zeros(TiledMatrix::padded(size));   // gradient, in whole tiles
+    std::vector<double> Cz = zeros(TiledMatrix::padded(size));   // gradient of the cost itself, in whole tiles
+    std::vector<double> terms = zeros(size);                     // of Q, as the scale of the value
+    std::vector<double> row = zeros(TiledMatrix::padded(size));  // in whole tiles
     // And of a decision.
-    std::vector<double> Quu,
-        factors;               // (m, m) regularized; L D L' of it
-    TiledMatrix K, Qux, rest;  // (m, x); the last is Quu K + Qux
+    std::vector<double> Quu = zeros(m, m), factors = zeros(m, m);  // regularized; L D L' of it
+    TiledMatrix K{m, x}, Qux{m, x}, rest{m, x};                    // (m, x); the last is Quu K + Qux
 };
 
 }  // namespace varpin

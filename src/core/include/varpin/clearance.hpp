@@ -60,18 +60,7 @@ class Clearance {
           damped_(damped),
           n_(mechanism.dof()),
           dynamics_(mechanism, false),
-          slopes_(mechanism, true),
-          before_(n_),
-          last_(n_),
-          q_(n_),
-          v_(n_),
-          rate_(n_),
-          error_q_(n_),
-          error_v_(n_),
-          aq_(n_ * n_),
-          av_(n_ * n_),
-          af_(n_ * n_),
-          lu_(n_ * n_) {
+          slopes_(mechanism, true) {
         const int points = std::max(narrow.points, wide ? wide->points : 0);
         const int steps = std::max(narrow.steps, wide ? wide->steps : 0);
         for (auto* rows : {&force_, &a_}) rows->resize(points * n_);
@@ -99,12 +88,12 @@ class Clearance {
     bool damped_;
     int n_;
     ForwardDynamics dynamics_, slopes_;
-    std::vector<double> force_, a_;        // (points, n) of a stretch: of the controls, and accelerations
-    std::vector<double> before_, last_;    // the same at the end of the stretch before
-    std::vector<double> step_q_, step_v_;  // defects of the steps of a stretch (steps, n)
-    std::int64_t from_ = 0, until_ = 0;    // its nodes
-    std::vector<double> q_, v_, rate_, error_q_, error_v_;
-    std::vector<double> aq_, av_, af_, lu_;
+    std::vector<double> force_, a_;  // (points, n) of a stretch: of the controls, and accelerations
+    std::vector<double> before_ = zeros(n_), last_ = zeros(n_);  // the same at the end of the stretch before
+    std::vector<double> step_q_, step_v_;                        // defects of the steps of a stretch (steps, n)
+    std::int64_t from_ = 0, until_ = 0;                          // its nodes
+    std::vector<double> q_ = zeros(n_), v_ = zeros(n_), rate_ = zeros(n_), error_q_ = zeros(n_), error_v_ = zeros(n_);
+    std::vector<double> aq_ = zeros(n_, n_), av_ = zeros(n_, n_), af_ = zeros(n_, n_), lu_ = zeros(n_, n_);
 
     // The error e of the motion from its defects l: e -> Phi e + l, with the flow Phi of the motion linearized in the
     // middle of each few steps, by the implicit midpoint rule.

@@ -67,14 +67,7 @@ class Collocation {
           n(mechanism.dof()),
           stages(tableau.stages),
           stage(stages, Jet<double>(mechanism.tree, false)),
-          V(stages * n),
-          Q(stages * n),
-          force_sum(stages * n),
-          force_rest(stages * n),
-          acting(stages * n),
-          residual(stages * n),
-          delta(stages * n),
-          next(stages * n) {
+          acting(stages * n) {
         for (Jet<double>& jet : stage) mechanism.couplings.fit(jet.couplings);
         measure_turning();
         if (mechanism.couplings.pushes()) {
@@ -97,14 +90,14 @@ class Collocation {
     int stages;
     std::vector<Jet<double>> stage;                // without matrices if there is an elimination
     std::unique_ptr<StepElimination> elimination;  // at the iterate of the last factors; null where there are matrices
-    std::vector<double> V;                         // (s, n) stage velocities: the guess, then the root
-    std::vector<double> Q;                         // (s, n)
-    std::vector<double> force_sum;                 // (s, n) L_q + F
-    std::vector<double> force_rest;                // (s, n) of correct_forces; less than the last digit of `force_sum`
-    std::vector<JointForce<double>> acting;        // (s, n) of elements and couplings; derivatives of elements only
-    std::vector<double> coupled_q;                 // (s, n, n) dF/dq of couplings, if there are such forces
-    std::vector<double> coupled_v;                 // (s, n, n) dF/dv
-    bool by_external = false;                      // whether derivatives in f are those in the external force
+    std::vector<double> V = zeros(stages, n);      // stage velocities: the guess, then the root
+    std::vector<double> Q = zeros(stages, n);
+    std::vector<double> force_sum = zeros(stages, n);   // L_q + F
+    std::vector<double> force_rest = zeros(stages, n);  // of correct_forces; less than the last digit of `force_sum`
+    std::vector<JointForce<double>> acting;  // (s, n) of elements and couplings; derivatives of elements only
+    std::vector<double> coupled_q;           // (s, n, n) dF/dq of couplings, if there are such forces
+    std::vector<double> coupled_v;           // (s, n, n) dF/dv
+    bool by_external = false;                // whether derivatives in f are those in the external force
 
     // Solve the step equation from the guess in V.
     //
@@ -225,10 +218,10 @@ class Collocation {
     // Safety factor of the estimate in left_by_bending; measured ratios of residual and estimate are below 1.
     static constexpr double bending = 10.0;
 
-    std::vector<double> residual, delta;    // (s, n)
-    std::vector<double> guess, from, next;  // (s, n) of `approach`
-    std::vector<double> lu;                 // the factors of each block, one after another
-    std::vector<int> order;                 // permutation of their rows
+    std::vector<double> residual = zeros(stages, n), delta = zeros(stages, n);
+    std::vector<double> guess, from, next = zeros(stages, n);  // of `approach`
+    std::vector<double> lu;                                    // the factors of each block, one after another
+    std::vector<int> order;                                    // permutation of their rows
     std::vector<double> change, local;
     std::vector<double> turning;  // (n) rotation of bodies per unit of a coordinate; infinite for a coordinate that
                                   // translates a body on a rotating one, where its product is NaN without motion

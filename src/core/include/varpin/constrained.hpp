@@ -32,16 +32,7 @@ class ConstrainedStepper : public VariationalStepper {
           inputs(mechanism.constraints.driven()),
           algebra(n, m),
           places(places),
-          weight(stages * stages),
-          point(stages),
-          total(m),
-          Qk(n),
-          scaled(n),
-          row_scale(m),
-          y(n),
-          bent(n * n),
-          mass(n * n),
-          curved(n * n) {
+          point(stages) {
         equation.every_kind = inputs.count() > 0;
         for (int i = 0; i < stages; ++i) {
             for (int k = 0; k < stages; ++k) weight[i * stages + k] = 1.0 - places[k * stages + i] / tableau.b[i];
@@ -75,17 +66,17 @@ class ConstrainedStepper : public VariationalStepper {
     ConstraintBasis there;               // at the end of a trial substep
     std::vector<double> from_q, from_v;  // (n) state at the beginning of the part, if there are cubic inputs
     std::vector<double> places;          // (s + 1, s) t_kj
-    std::vector<double> weight;          // (s, s) w_ik
-    std::vector<ConstraintJet> point;    // of Lobatto points 1 .. s
-    std::vector<double> total;           // (m)
-    std::vector<double> last;            // (m) Lam_s
-    std::vector<double> rate;            // (m) rates of kinematic inputs in the part
-    double unresolved = 0.0;             // velocity below the rounding of the last residuals
-    std::vector<double> Qk, scaled, row_scale, y, bent;
+    std::vector<double> weight = zeros(stages, stages);  // w_ik
+    std::vector<ConstraintJet> point;                    // of Lobatto points 1 .. s
+    std::vector<double> total = zeros(m);
+    std::vector<double> last;  // (m) Lam_s
+    std::vector<double> rate;  // (m) rates of kinematic inputs in the part
+    double unresolved = 0.0;   // velocity below the rounding of the last residuals
+    std::vector<double> Qk = zeros(n), scaled = zeros(n), row_scale = zeros(m), y = zeros(n), bent = zeros(n, n);
     std::vector<double> block, saddle, right, solution;
     std::vector<int> rows;
     std::vector<double> null, reduced_mass, reduced;
-    std::vector<double> mass, curved;  // (n, n)
+    std::vector<double> mass = zeros(n, n), curved = zeros(n, n);
 
     const ConstraintJet& jet_at(int k) const { return k == 0 ? here.jet : point[k - 1]; }
 
@@ -238,7 +229,7 @@ class ConstrainedStepper : public VariationalStepper {
             rate[row] = inputs.rate_at(d, inputs.share, h, state.position[coordinate].value.high);
         }
         for (int i = 0; i < n; ++i) at[i] = trial.position[i].value.high;
-        if (!jets_wanted) exchange(there.jet, point.back());
+        if (!jets_wanted) swap(there.jet, point.back());
         if (!find_basis(at.data(), state.rank, there, !jets_wanted)) return Outcome::singular;
         if (there.toggles()) {
             state.weakest = there.weakest;
@@ -264,8 +255,8 @@ class ConstrainedStepper : public VariationalStepper {
             state.impulse[r] -= sum;
         }
         state.rate = rate;
-        exchange(origin, here);
-        exchange(here, there);
+        swap(origin, here);
+        swap(here, there);
         return turned && !factor_at(state) ? Outcome::singular : Outcome::solved;
     }
 

@@ -26,8 +26,7 @@ class ConstrainedLinearization {
           m(stepper.m),
           stages(stepper.stages),
           state(mechanism, stages),
-          chained(n, inputs.count()),
-          y(n) {}
+          chained(n, inputs.count()) {}
 
     // With `ramp` those in the force are in one that grows linearly from 0; `rates` are those of kinematic inputs at
     // their goals, and Jr (2n, driven rows) the derivatives in them, zero for linear ones.
@@ -68,13 +67,13 @@ class ConstrainedLinearization {
     PathState state;
     ChainedDerivatives chained;
     std::array<std::vector<double>, 2> by_rates;  // (2n, 2n) and (2n, n), derivatives in rates at both ends
-    std::vector<double> dV, columns, bends, y;
+    std::vector<double> dV, columns, bends, y = zeros(n);
 
     // Derivatives of the last substep, from (q0, p0) under the force f: of (q1, p1) in (q0, p0), Jx, in f, Jf, and in
     // the rates of kinematic inputs at their goals, Jr. It is the part of the step at `begin` with length `share`.
     void derivatives(double h, double begin, double share, double* Jx, double* Jf, double* Jr) {
         if (ramp) stepper.equation.weigh_ramp(begin, share);
-        exchange(here, stepper.origin);
+        swap(here, stepper.origin);
         stepper.assemble(h);
         factor_lu_pivoting(stepper.saddle.data(), stages * (n + here.rank()), stepper.rows.data());
         bend_points();
@@ -85,7 +84,7 @@ class ConstrainedLinearization {
             by_rates[end].resize(6 * n * n);
             end_columns(h, by_rates[end].data(), by_rates[end].data() + 4 * n * n);
         }
-        exchange(here, stepper.origin);
+        swap(here, stepper.origin);
         project(h, Goal::position, Jx, Jf);
         if (!inputs.cubic) return;
         for (int end = 0; end < 2; ++end)

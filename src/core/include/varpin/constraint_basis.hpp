@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <tuple>
 #include <utility>
 #include <vector>
 
@@ -49,6 +50,7 @@ struct ConstraintBasis {
     double least = 1.0;        // the smallest diagonal entry of R, in units of its row
     int weakest = 0;           // the row of this entry
 
+    auto all() { return std::tie(jet, ldl, root, rows, Q, R, size, order, least, weakest); }
     int dof() const { return static_cast<int>(root.size()); }
     int rank() const { return static_cast<int>(order.size()); }
     bool toggles() const { return !(least > near_toggle) && rank() > 0; }
@@ -76,36 +78,15 @@ struct ConstraintBasis {
     }
 };
 
-// Three moves of so many arrays take a twentieth of a small step.
-inline void exchange(ConstraintBasis& a, ConstraintBasis& b) {
-    exchange(a.jet, b.jet);
-    a.ldl.swap(b.ldl);
-    a.root.swap(b.root);
-    a.rows.swap(b.rows);
-    a.Q.swap(b.Q);
-    a.R.swap(b.R);
-    a.size.swap(b.size);
-    a.order.swap(b.order);
-    std::swap(a.least, b.least);
-    std::swap(a.weakest, b.weakest);
+inline void swap(ConstraintBasis& a, ConstraintBasis& b) {
+    auto own = a.all(), other = b.all();
+    own.swap(other);
 }
 
 // Work on bases of n coordinates and m rows.
 class ConstraintAlgebra {
   public:
-    ConstraintAlgebra(int n, int m)
-        : n(n),
-          m(m),
-          white(n),
-          along(n),
-          wanted(n),
-          unit(n),
-          unspanned(n),
-          rest(m * n),
-          parts(m * n),
-          product(n * n),
-          even(n * n),
-          taken(m) {}
+    ConstraintAlgebra(int n, int m) : n(n), m(m), taken(m) {}
 
     // Fill a basis from its jet and the factors of M: the `rank` most independent rows, or all independent ones for -1.
     void orthogonalize(const std::vector<double>& factors, int rank, ConstraintBasis& basis) {
@@ -182,12 +163,12 @@ class ConstraintAlgebra {
 
   private:
     int n, m;
-    std::vector<double> white, along, wanted;  // (n)
-    std::vector<double> unit;                  // (n) greatest displacements
-    std::vector<double> unspanned;             // (n) squared norms of the rest of the unit vectors
-    std::vector<double> rest, parts;           // (m, n)
-    std::vector<double> product, even;         // (n, n)
-    std::vector<char> taken;                   // whether a row is in the basis
+    std::vector<double> white = zeros(n), along = zeros(n), wanted = zeros(n);
+    std::vector<double> unit = zeros(n);       // greatest displacements
+    std::vector<double> unspanned = zeros(n);  // squared norms of the rest of the unit vectors
+    std::vector<double> rest = zeros(m, n), parts = zeros(m, n);
+    std::vector<double> product = zeros(n, n), even = zeros(n, n);
+    std::vector<char> taken;  // whether a row is in the basis
 
     // The rows of C in the metric of the kinetic energy, and the size of the terms that cancel in each: their squares
     // times the diagonal of M^-1.

@@ -369,30 +369,36 @@ class Couplings {
         }
     }
 
+    // Adds the forces of a damper on the sum of v_i lever(i), and dF/dv; returns the drag.
+    template <class T, class Lever>
+    static Vec3<T> add_drag(const Vec3<double>& damping, int n, const T* v, const std::vector<Arm<T>>& arms,
+                            const Lever& lever, JointForce<T>* out, T* by_v) {
+        Vec3<T> rate{};
+        double rates = 0.0;
+        for (const Arm<T>& arm : arms) {
+            const Vec3<T> share = v[arm.coordinate] * lever(arm);
+            rate += share;
+            rates += detail::size_of(share);
+        }
+        const Vec3<T> drag = detail::entrywise(damping, rate);
+        for (const Arm<T>& i : arms) {
+            JointForce<T>& at = out[i.coordinate];
+            at.value += -dot(drag, lever(i));
+            at.scale += detail::size_of(damping) * rates * detail::size_of(lever(i));
+            const Vec3<T> damped = detail::entrywise(damping, lever(i));
+            for (std::size_t j = 0; by_v && j < arms.size(); ++j)
+                by_v[i.coordinate * n + arms[j].coordinate] -= dot(damped, lever(arms[j]));
+        }
+        if (!arms.empty()) out[arms[0].coordinate].lost += value_of(dot(drag, rate));
+        return drag;
+    }
+
     template <class T>
     static void push(const FrameDamper& damper, int n, const T* v, CouplingWorkspace<T>& workspace, JointForce<T>* out,
                      T* by_q, T* by_v) {
         const auto& arms = workspace.arms;
-        Vec3<T> rate{};
-        double rates = 0.0;
-        for (const Arm<T>& arm : arms) {
-            const Vec3<T> share = v[arm.coordinate] * arm.linear;
-            rate += share;
-            rates += detail::size_of(share);
-        }
-        const Vec3<T> drag = detail::entrywise(damper.damping, rate);
-        for (const Arm<T>& arm : arms) {
-            JointForce<T>& at = out[arm.coordinate];
-            at.value += -dot(drag, arm.linear);
-            at.scale += detail::size_of(damper.damping) * rates * detail::size_of(arm.linear);
-        }
-        if (!arms.empty()) out[arms[0].coordinate].lost += value_of(dot(drag, rate));
-        if (by_v) {
-            for (const Arm<T>& i : arms) {
-                const Vec3<T> damped = detail::entrywise(damper.damping, i.linear);
-                for (const Arm<T>& j : arms) by_v[i.coordinate * n + j.coordinate] -= dot(damped, j.linear);
-            }
-        }
+        const auto linear = [](const Arm<T>& arm) { return arm.linear; };
+        const Vec3<T> drag = add_drag(damper.damping, n, v, arms, linear, out, by_v);
         if (!by_q) return;
         turning(arms, drag, [&](int i, int j, const T& term) { by_q[i * n + j] -= term; });
         // d(J v)/dq_j = w_j x sum of l_i v_i from j on + (sum of w_i v_i before j) x l_j
@@ -421,26 +427,7 @@ class Couplings {
                      JointForce<T>* out, T* by_q, T* by_v) {
         const auto& arms = workspace.arms;
         const auto signed_axis = [](const Arm<T>& arm) { return (arm.point == 0 ? 1.0 : -1.0) * arm.angular; };
-        Vec3<T> rate{};
-        double rates = 0.0;
-        for (const Arm<T>& arm : arms) {
-            const Vec3<T> share = v[arm.coordinate] * signed_axis(arm);
-            rate += share;
-            rates += detail::size_of(share);
-        }
-        const Vec3<T> drag = detail::entrywise(damper.damping, rate);
-        for (const Arm<T>& arm : arms) {
-            JointForce<T>& at = out[arm.coordinate];
-            at.value += -dot(drag, signed_axis(arm));
-            at.scale += detail::size_of(damper.damping) * rates * detail::size_of(arm.angular);
-        }
-        if (!arms.empty()) out[arms[0].coordinate].lost += value_of(dot(drag, rate));
-        if (by_v) {
-            for (const Arm<T>& i : arms) {
-                const Vec3<T> damped = detail::entrywise(damper.damping, signed_axis(i));
-                for (const Arm<T>& j : arms) by_v[i.coordinate * n + j.coordinate] -= dot(damped, signed_axis(j));
-            }
-        }
+        const Vec3<T> drag = add_drag(damper.damping, n, v, arms, signed_axis, out, by_v);
         if (!by_q) return;
         workspace.change.assign(arms.size(), Vec3<T>{});
         Vec3<T> beyond{};

@@ -32,32 +32,42 @@ namespace detail {
     if (c < last) y[c] -= s * x[c];
 }
 
+// Column k of L U below the diagonal, and what is left of the rows below row k.
+[[gnu::always_inline]] inline void eliminate_column(double* a, int n, int k, int end) {
+    const double* top = a + k * n;
+    const double inverse = 1.0 / top[k];
+    for (int i = k + 1; i < end; ++i) {
+        double* row = a + i * n;
+        const double factor = row[k] * inverse;
+        row[k] = factor;
+        subtract_scaled(row, factor, top, k + 1, end);
+    }
+}
+
 }  // namespace detail
 
 // LU in place without pivoting; false at a pivot that is not positive. For a matrix whose symmetric part is positive
 // definite every pivot is positive and none grows without bound.
 inline bool factor_lu(double* a, int n, Block block) {
     for (int k = block.begin; k < block.end; ++k) {
-        const double* top = a + k * n;
-        if (!(top[k] > 0.0)) return false;
-        const double inverse = 1.0 / top[k];
-        for (int i = k + 1; i < block.end; ++i) {
-            double* row = a + i * n;
-            const double factor = row[k] * inverse;
-            row[k] = factor;
-            detail::subtract_scaled(row, factor, top, k + 1, block.end);
-        }
+        if (!(a[k * n + k] > 0.0)) return false;
+        detail::eliminate_column(a, n, k, block.end);
     }
     return true;
 }
 
-// The x with L U x = b; x may be b.
-inline void solve_lu(const double* lu, int n, Block block, const double* b, double* x) {
+// The x with L x = b for the unit L below the diagonal; x may be b.
+inline void solve_lower(const double* factors, int n, Block block, const double* b, double* x) {
     for (int i = block.begin; i < block.end; ++i) {
         double total = b[i];
-        for (int j = block.begin; j < i; ++j) total -= lu[i * n + j] * x[j];
+        for (int j = block.begin; j < i; ++j) total -= factors[i * n + j] * x[j];
         x[i] = total;
     }
+}
+
+// The x with L U x = b; x may be b.
+inline void solve_lu(const double* lu, int n, Block block, const double* b, double* x) {
+    solve_lower(lu, n, block, b, x);
     for (int i = block.end - 1; i >= block.begin; --i) {
         double total = x[i];
         for (int j = i + 1; j < block.end; ++j) total -= lu[i * n + j] * x[j];
@@ -80,33 +90,18 @@ inline int factor_lu_pivoting(double* a, int n, int* order) {
             std::swap(order[k], order[best]);
             for (int j = 0; j < n; ++j) std::swap(a[k * n + j], a[best * n + j]);
         }
-        const double* top = a + k * n;
-        const double pivot = top[k];
+        const double pivot = a[k * n + k];
         if (!(std::abs(pivot) > 0.0) || !(std::abs(pivot) < std::numeric_limits<double>::infinity())) return 0;
         if (pivot < 0.0) sign = -sign;
-        const double inverse = 1.0 / pivot;
-        for (int i = k + 1; i < n; ++i) {
-            double* row = a + i * n;
-            const double factor = row[k] * inverse;
-            row[k] = factor;
-            detail::subtract_scaled(row, factor, top, k + 1, n);
-        }
+        detail::eliminate_column(a, n, k, n);
     }
     return sign;
 }
 
 // The x with a x = b, from the factors of factor_lu_pivoting.
 inline void solve_lu_pivoting(const double* lu, int n, const int* order, const double* b, double* x) {
-    for (int i = 0; i < n; ++i) {
-        double total = b[order[i]];
-        for (int j = 0; j < i; ++j) total -= lu[i * n + j] * x[j];
-        x[i] = total;
-    }
-    for (int i = n - 1; i >= 0; --i) {
-        double total = x[i];
-        for (int j = i + 1; j < n; ++j) total -= lu[i * n + j] * x[j];
-        x[i] = total / lu[i * n + i];
-    }
+    for (int i = 0; i < n; ++i) x[i] = b[order[i]];
+    solve_lu(lu, n, {0, n}, x, x);
 }
 
 // The x with a' x = b from the factors of a; `order` is null for factors without pivoting. Overwrites b.
@@ -161,14 +156,7 @@ inline double least_pivot_ratio(double* a, double* b, int n, Block block) {
     return least;
 }
 
-// The x with L x = b; solve_upper overwrites b, given in x, by the x with L' x = b.
-inline void solve_lower(const double* ldl, int n, Block block, const double* b, double* x) {
-    for (int i = block.begin; i < block.end; ++i) {
-        double total = b[i];
-        for (int j = block.begin; j < i; ++j) total -= ldl[i * n + j] * x[j];
-        x[i] = total;
-    }
-}
+// Overwrites b, given in x, by the x with L' x = b.
 inline void solve_upper(const double* ldl, int n, Block block, double* x) {
     for (int i = block.end - 1; i >= block.begin; --i) {
         double total = x[i];

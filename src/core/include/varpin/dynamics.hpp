@@ -20,8 +20,6 @@
 #include "varpin/dense.hpp"
 #include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
-#include "varpin/simd.hpp"
-#include "varpin/slope_rows.hpp"
 #include "varpin/slopes.hpp"
 #include "varpin/spatial.hpp"
 #include "varpin/tree.hpp"
@@ -76,16 +74,7 @@ constexpr Force<T> operator*(const Coupling& C, const Vec3<T>& b) {
 class ForwardDynamics {
   public:
     ForwardDynamics(const Mechanism& mechanism, bool derivatives)
-        : mechanism_(&mechanism),
-          jet_(mechanism.tree, false),
-          body_(mechanism.tree.bodies.size()),
-          q_(jet_.dof),
-          v_(jet_.dof),
-          acting_(jet_.dof),
-          curvature_(jet_.dof),
-          bias_(jet_.dof),
-          room_(jet_.dof),
-          momentum_(jet_.dof) {
+        : mechanism_(&mechanism), jet_(mechanism.tree, false), body_(mechanism.tree.bodies.size()), acting_(jet_.dof) {
         const int n = jet_.dof;
         mechanism.couplings.fit(jet_.couplings);
         if (!derivatives && eliminates(mechanism.tree)) {
@@ -242,7 +231,7 @@ class ForwardDynamics {
         }
     }
 
-    // A contribution of an earlier stage to the derivatives: q and v change by in_q x and in_v x, where x (b, columns)
+    // A contribution of an earlier stage to the derivatives: q and v change by in_q x and in_v x, where x (b, 3b)
     // are the derivatives of that stage's accelerations.
     struct Before {
         const double* x = nullptr;
@@ -250,12 +239,11 @@ class ForwardDynamics {
     };
 
     // How the accelerations of one block of b coordinates change with q, v and force, columns side by side in `a`
-    // (b, columns), once after differentiate(): M^-1 (-tau_q, -tau_v - reach tau_q, ramp) with reach = 0 and ramp
-    // 1; in_q x and in_v x are changes of q and v besides, of which no more than two share.
-    void slope(Block block, double* a, double reach, const Before* others, int count, double ramp) {
-        const int n = jet_.dof, size = block.end - block.begin, columns = SlopeRows::columns(size);
+    // (b, 3b), once after differentiate(): M^-1 (-tau_q, -tau_v - reach tau_q, ramp) with reach = 0 and ramp 1; in_q x
+    // and in_v x are changes of q and v besides.
+    void slope(Block block, double* a, double reach, const Before* others, int count, double ramp) const {
+        const int n = jet_.dof, size = block.end - block.begin, columns = 3 * size;
         const double *by_q = slopes_.data() + block.begin * 2 * n + block.begin, *by_v = by_q + n;
-        SlopeRows rows{size, ldl_.data() + block.begin * n + block.begin, n, 2 * n, {}, 0};
         for (int i = 0; i < size; ++i) {
             double* row = a + i * columns;
             const double *of_q = by_q + i * 2 * n, *of_v = by_v + i * 2 * n;
@@ -263,13 +251,18 @@ class ForwardDynamics {
             for (int j = 0; j < size; ++j) row[size + j] = of_v[j] + reach * of_q[j];
             std::fill(row + 2 * size, row + columns, 0.0);
             row[2 * size + i] = ramp * (1.0 + acting_[block.begin + i].by_f);
+            for (int o = 0; o < count; ++o) {
+                const auto add = [&](double scale, const double* weight) {
+                    if (scale == 0.0) return;
+                    subtract_rows(
+                        row, columns, 0, size, [=](int k) { return -scale * weight[k]; },
+                        [=](int k) { return others[o].x + k * columns; });
+                };
+                add(others[o].in_q, of_q);
+                add(others[o].in_v, of_v);
+            }
         }
-        for (int k = 0; k < count; ++k) {
-            const Before& other = others[k];
-            if (other.in_q != 0.0) rows.other[rows.others++] = {other.in_q, by_q, other.x};
-            if (other.in_v != 0.0) rows.other[rows.others++] = {other.in_v, by_v, other.x};
-        }
-        solve_slope_rows(rows, a);
+        solve_ldl_rows(ldl_.data() + block.begin * (n + 1), n, {0, size}, a, columns, columns);
     }
 
   private:
@@ -374,15 +367,15 @@ class ForwardDynamics {
     const Mechanism* mechanism_;
     Jet<double> jet_;  // placements, velocities, inertias of subtrees, M, potential
     std::vector<BodyState> body_;
-    std::vector<double> q_, v_;                                      // (n)
+    std::vector<double> q_ = zeros(jet_.dof), v_ = zeros(jet_.dof);
     std::vector<JointForce<double>> acting_;                         // (n) of elements, at the last force
-    std::vector<double> curvature_;                                  // (n) of the elements' potentials
+    std::vector<double> curvature_ = zeros(jet_.dof);                // of the elements' potentials
     std::vector<double> coupled_q_, coupled_v_, coupled_curvature_;  // (n, n) of couplings, for derivatives
-    std::vector<double> bias_, room_;
-    std::optional<ArticulatedBodies> articulated_;  // in place of M
-    std::vector<double> momentum_;                  // (n) with articulated bodies only
-    std::vector<double> ldl_;                       // (n, n) factors of M
-    std::vector<double> slopes_;                    // (n, 2n) of inverse dynamics in (q, v), their negatives
+    std::vector<double> bias_ = zeros(jet_.dof), room_ = zeros(jet_.dof);
+    std::optional<ArticulatedBodies> articulated_;    // in place of M
+    std::vector<double> momentum_ = zeros(jet_.dof);  // with articulated bodies only
+    std::vector<double> ldl_;                         // (n, n) factors of M
+    std::vector<double> slopes_;                      // (n, 2n) of inverse dynamics in (q, v), their negatives
 };
 
 }  // namespace varpin

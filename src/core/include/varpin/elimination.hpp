@@ -145,12 +145,9 @@ class SizedElimination final : public StepElimination {
           bodies_(9 * stages_),
           width_(detail::even(bodies_ + stages_ * order->mimics.slots)),
           state_(tree_->size() * stages_),
-          factors_(tree_->size() * factor_size()),
           matrix_(order, width_ * width_),
           force_(order, width_),
-          motion_(width_ * (tree_->size() + 1)),
           twist_(tree_->size()),
-          lu_(stages_ * stages_),
           rows_(stages_),
           curved_(*tree_, order, 12 * stages_),
           masses_(*tree_, order, 6 * stages_) {}
@@ -449,11 +446,11 @@ class SizedElimination final : public StepElimination {
     int bodies_;   // nine entries for each stage
     Width width_;  // plus one for each stage and slot of mimic joints, rounded up to an even number
     std::vector<EliminatedBody> state_;  // (b, s)
-    std::vector<double> factors_;
+    std::vector<double> factors_ = zeros(tree_->size(), factor_size());
     detail::SubtreeSums matrix_, force_;
-    std::vector<double> motion_;  // (b + 1, width) for the x of `solve`, after a zero for the base
+    std::vector<double> motion_ = zeros(width_, tree_->size() + 1);  // for the x of `solve`, after a zero for the base
     std::vector<Motion<double>> twist_;
-    std::vector<double> lu_;
+    std::vector<double> lu_ = zeros(stages_, stages_);
     std::vector<int> rows_;
     SymmetricElimination<Curved> curved_;
     SymmetricElimination<Mass> masses_;

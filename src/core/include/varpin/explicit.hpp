@@ -62,14 +62,14 @@ class ExplicitStepper {
           dynamics(mechanism, derivatives),
           mechanism_(&mechanism),
           coefficients_(nystroem_of(method)),
-          derivatives_(derivatives),
-          stage_q_(mechanism.dof()),
-          stage_v_(mechanism.dof()) {
+          derivatives_(derivatives) {
         for (int i = 0; i < stages(); ++i) {
             a_[i].resize(mechanism.dof());
-            if (derivatives) slope_[i].resize(blocks_size(mechanism.tree));
+            for (const Block& block : mechanism.tree.blocks) {
+                const int size = block.end - block.begin;
+                if (derivatives) slope_[i].resize(slope_[i].size() + 3 * size * size);
+            }
         }
-        if (derivatives) row_.resize(SlopeRows::columns(mechanism.dof()));
     }
 
     std::vector<double> q, v;  // the state
@@ -100,20 +100,21 @@ class ExplicitStepper {
     // outside of blocks are zero already.
     void write_derivatives(double h, double* Jx, double* Jf) {
         const int n = mechanism_->dof();
-        const SlopeSum q = ends(h * h, coefficients_.end_q), v = ends(h, coefficients_.end_v);
         int first = 0;
         for (const Block& block : mechanism_->tree.blocks) {
-            const int size = block.end - block.begin, columns = SlopeRows::columns(size);
-            for (int row = block.begin; row < block.end; ++row, first += columns) {
-                const auto write = [&](const SlopeSum& sum, int to) {
-                    add_slopes(sum, first, columns, row_.data());
+            const int size = block.end - block.begin;
+            for (int row = block.begin; row < block.end; ++row, first += 3 * size) {
+                const auto write = [&](double scale, const double* weight, int to) {
+                    std::fill_n(row_.begin(), 3 * size, 0.0);
+                    for (int i = 0; i < stages(); ++i)
+                        detail::subtract_scaled(row_.data(), -scale * weight[i], &slope_[i][first], 0, 3 * size);
                     double* x = Jx + to * 2 * n + block.begin;
                     std::copy_n(row_.data(), size, x);
                     std::copy_n(row_.data() + size, size, x + n);
                     std::copy_n(row_.data() + 2 * size, size, Jf + to * n + block.begin);
                 };
-                write(q, row);
-                write(v, n + row);
+                write(h * h, coefficients_.end_q, row);
+                write(h, coefficients_.end_v, n + row);
                 Jx[row * 2 * n + row] += 1.0;
                 Jx[row * 2 * n + n + row] += h;
                 Jx[(n + row) * 2 * n + n + row] += 1.0;
@@ -122,15 +123,6 @@ class ExplicitStepper {
     }
 
   private:
-    static int blocks_size(const Tree& tree) {
-        int size = 0;
-        for (const Block& block : tree.blocks) {
-            const int own = block.end - block.begin;
-            size += own * SlopeRows::columns(own);
-        }
-        return size;
-    }
-
     // Set to_q = q + reach h v + h^2 sum_i in_q[i] a_i and to_v = v + h sum_i in_v[i] a_i, with sums over `stages`.
     void move(double h, double reach, const double* in_q, const double* in_v, int stages, double* to_q,
               double* to_v) const {
@@ -157,28 +149,17 @@ class ExplicitStepper {
             for (int k = 0; k < i; ++k) before[k].x = slope_[k].data() + first;
             dynamics.slope(block, slope_[i].data() + first, h * coefficients_.reach[i], before, i,
                            ramp ? coefficients_.reach[i] : 1.0);
-            first += size * SlopeRows::columns(size);
+            first += 3 * size * size;
         }
-    }
-
-    // scale sum_i weight[i] slope_i.
-    SlopeSum ends(double scale, const double* weight) const {
-        SlopeSum sum;
-        for (int i = 0; i < stages(); ++i) {
-            if (weight[i] == 0.0) continue;
-            sum.x[sum.count] = slope_[i].data();
-            sum.factor[sum.count++] = scale * weight[i];
-        }
-        return sum;
     }
 
     const Mechanism* mechanism_;
     Nystroem coefficients_;
     bool derivatives_;
-    std::vector<double> stage_q_, stage_v_;
+    std::vector<double> stage_q_ = zeros(mechanism_->dof()), stage_v_ = zeros(mechanism_->dof());
     std::vector<double> a_[4];      // (n) of each stage
-    std::vector<double> slope_[4];  // their derivatives (b, columns) in q, v and force, block after block
-    std::vector<double> row_;       // one row of their sum
+    std::vector<double> slope_[4];  // their derivatives (b, 3b) in q, v and force, block after block
+    std::vector<double> row_ = zeros(3, mechanism_->dof());  // one row of their sum
 };
 
 // Rollouts of P paths, each from its own state.
@@ -191,10 +172,7 @@ class ExplicitRollout {
           mechanism_(&mechanism),
           method_(method),
           paths_(paths),
-          center_(q.size() * mechanism.diffusion.processes),
-          stepper_(mechanism, method, false),
-          force_(stepper_.abscissae() * mechanism.dof()),
-          jump_(mechanism.dof()) {
+          stepper_(mechanism, method, false) {
         for (std::int64_t i = 0; i < paths; ++i) diffusion_centers(mechanism, q0 + i * mechanism.dof(), center(i));
     }
 
@@ -208,32 +186,23 @@ class ExplicitRollout {
     bool first_nodes(const Nodes& nodes) {
         for (std::int64_t i = 0; i < paths_; ++i) {
             load(i);
-            if (enter_node(nodes, i, 0) == Outcome::singular) return false;
+            if (enter_node(nodes, i * nodes.steps) == Outcome::singular) return false;
             nodes.done[i] = 1;
         }
         return true;
     }
 
-    // Take all steps, each of length h. Each of these may be null: increments (P, N, K), a drift (P, N, n) added to the
-    // controls' force, and impulses (P, N, 2, n) added to the noise's before and after each step.
-    void roll(double h, const Commands& commands, const double* increments, const double* drift, const double* impulses,
-              const Nodes& nodes) {
-        for (std::int64_t i = 0; i < paths_; ++i) {
-            load(i);
-            nodes.done[i] = 0;
-            Outcome outcome = Outcome::solved;
-            bool regular = at_state();
-            for (std::int64_t s = 0; s < nodes.steps; ++s) {
-                const std::int64_t row = i * nodes.steps + s;
-                const double* dw = increments ? increments + row * increments_of_step(*mechanism_, commands) : nullptr;
-                const double* kicks = impulses ? impulses + 2 * row * dof() : nullptr;
-                outcome = step(h, commands, dw, drift ? drift + row * dof() : nullptr, kicks, regular, nodes, i, s);
-                if (outcome != Outcome::solved) break;
-                nodes.done[i] = s + 1;
-            }
-            nodes.ended[i] = static_cast<std::int64_t>(outcome);
-            store(i);
-        }
+    // Advance every path by N steps of length h.
+    void roll(double h, const Commands& commands, const Additions& more, const Nodes& nodes) {
+        const auto begin = [&](std::int64_t path) {
+            load(path);
+            return Entry{at_state() ? Outcome::solved : Outcome::singular, stepper_.q.data(), stepper_.v.data()};
+        };
+        driver_.roll(*mechanism_, commands, more, stepper_.abscissae(), nodes, begin, [&](const StepInputs& in) {
+            const Outcome outcome = step(h, in, nodes);
+            store(in.path);
+            return outcome;
+        });
     }
 
   private:
@@ -251,33 +220,24 @@ class ExplicitRollout {
     bool at_state() { return stepper_.dynamics.at(stepper_.q.data(), stepper_.v.data()); }
 
     // One step of a path, with its node. `dynamics` is at the path's state before and after.
-    Outcome step(double h, const Commands& commands, const double* dw, const double* drift, const double* kicks,
-                 bool regular, const Nodes& nodes, std::int64_t path, std::int64_t s) {
-        const int n = dof(), m = mechanism_->controls;
-        std::vector<double>& at_q = stepper_.q;
-        std::vector<double>& at_v = stepper_.v;
-        double* u = nodes.u + path * nodes.steps * m;
-        apply_policy(commands, path, s, n, at_q.data(), at_v.data(), u);
-        const double* within = stage_controls(commands, path, s, stepper_.abscissae(), u, line_);
-        const Felt felt = felt_controls(commands, path, s, u, seen_);
-        u += s * m;
-        stage_forces(*mechanism_, drift, within ? within : u, within ? stepper_.abscissae() : 1, force_.data());
-        if (!regular) return Outcome::singular;
+    Outcome step(double h, const StepInputs& in, const Nodes& nodes) {
         const bool beside = method_ == ExplicitMethod::euler;
-        if (kicks) kick(kicks);
-        if (dw) {
-            noise_impulse(*mechanism_, 1.0, at_q.data(), center(path), felt, dw, jump_.data());
+        stage_forces(*mechanism_, in.drift, in.within ? in.within : in.u, in.within ? stepper_.abscissae() : 1,
+                     force_.data());
+        if (in.impulses) kick(in.impulses);
+        if (in.increments) {
+            noise_impulse(*mechanism_, 1.0, stepper_.q.data(), center(in.path), in.felt, in.increments, jump_.data());
             stepper_.dynamics.solve_mass(jump_.data(), jump_.data());
             if (!beside) {
                 add_jump();
                 at_state();
             }
         }
-        regular = stepper_.step(h, force_.data(), within ? n : 0);
-        if (dw && beside) add_jump();
-        if (kicks && regular && at_state()) kick(kicks + n);
-        nodes.tally[(path * nodes.steps + s) * 4 + 2] = stepper_.stages();
-        return regular ? enter_node(nodes, path, s) : Outcome::singular;
+        const bool regular = stepper_.step(h, force_.data(), in.within ? dof() : 0);
+        if (in.increments && beside) add_jump();
+        if (in.impulses && regular && at_state()) kick(in.impulses + dof());
+        nodes.tally[in.row * 4 + 2] = stepper_.stages();
+        return regular ? enter_node(nodes, in.row) : Outcome::singular;
     }
 
     // Apply an impulse (n) at the state, which is that of `dynamics`.
@@ -291,9 +251,8 @@ class ExplicitRollout {
         for (int r = 0; r < dof(); ++r) stepper_.v[r] += jump_[r];
     }
 
-    // Write the state as node s of a path; `dynamics` is at the state afterwards.
-    Outcome enter_node(const Nodes& nodes, std::int64_t path, std::int64_t s) {
-        const std::int64_t row = path * nodes.steps + s;
+    // Write the state as the node of a row; `dynamics` is at the state afterwards.
+    Outcome enter_node(const Nodes& nodes, std::int64_t row) {
         const bool regular = at_state();
         std::copy_n(stepper_.q.data(), dof(), nodes.q + row * dof());
         std::copy_n(stepper_.v.data(), dof(), nodes.v + row * dof());
@@ -305,9 +264,10 @@ class ExplicitRollout {
     const Mechanism* mechanism_;
     ExplicitMethod method_;
     std::int64_t paths_;
-    std::vector<double> center_;  // (P, n, k) of the diffusion fields
+    std::vector<double> center_ = zeros(paths_ * dof(), mechanism_->diffusion.processes);  // of the diffusion fields
     ExplicitStepper stepper_;
-    std::vector<double> force_, jump_, line_, seen_;
+    std::vector<double> force_ = zeros(stepper_.abscissae(), dof()), jump_ = zeros(dof());
+    PathDriver driver_;
 };
 
 }  // namespace varpin

@@ -266,17 +266,8 @@ class Forces {
         });
     }
 
-    // Whether an element changes the constant force on its joint, and whether one limits it.
-    bool drives() const { return drives_; }
+    // Whether an element limits the constant force on its joint.
     bool limits() const { return limits_; }
-
-    // Replaces the constant forces f (n) on the joints of such elements by the forces of their drives at q and v (n).
-    void drive(const double* q, const double* v, double* f) const {
-        each([&](const auto& element) {
-            const int c = element.coordinate;
-            if constexpr (requires { element.force(0.0, 0.0, 0.0); }) f[c] += element.force(q[c], v[c], f[c]).value;
-        });
-    }
 
   private:
     template <class>
@@ -290,7 +281,6 @@ class Forces {
     std::vector<char> anchored_;
     bool any_ = false;
     bool linear_ = true;
-    bool drives_ = false;
     bool limits_ = false;
 
     template <class Kind>
@@ -298,10 +288,7 @@ class Forces {
         std::get<std::vector<Kind>>(kinds_).push_back(element);
         any_ = true;
         linear_ = linear_ && element.linear();
-        if constexpr (requires { element.force(0.0, 0.0, 0.0); }) {
-            drives_ = true;
-            limits_ = limits_ || !element.linear();
-        }
+        if constexpr (requires { element.force(0.0, 0.0, 0.0); }) limits_ = limits_ || !element.linear();
         if (!Kind::anchored) return;
         if (!anchors(element.coordinate))
             anchored_.resize(std::max<std::size_t>(anchored_.size(), element.coordinate + 1));

@@ -107,13 +107,6 @@ class EnergyGuard {
           kernels(kernels),
           n(mechanism.dof()),
           jet(mechanism.tree, false),
-          kinetic(mechanism.tree.groups),
-          turnover(mechanism.tree.groups),
-          work(mechanism.tree.groups),
-          lost(mechanism.tree.groups),
-          magnitude(mechanism.tree.groups),
-          share(n),
-          diagonal(n),
           part(Energies(mechanism.tree).part) {
         mechanism.couplings.fit(jet.couplings);
         if (!dense && eliminates(mechanism.tree)) {
@@ -275,12 +268,14 @@ class EnergyGuard {
     int n;
     Jet<double> jet;
     std::optional<ArticulatedBodies> articulated;
-    std::vector<double> ldl;                // (n, n) factors of M, unless bodies are articulated
-    std::vector<double> kinetic, turnover;  // of each group [J]
-    std::vector<double> work, lost;         // of each group over the substep, and by friction [J]
-    std::vector<double> magnitude;          // of each group, as in Trial
-    std::vector<double> share;              // (n)
-    std::vector<double> diagonal;           // (n) of the branch guard
+    std::vector<double> ldl;  // (n, n) factors of M, unless bodies are articulated
+    std::vector<double> kinetic = zeros(mechanism.tree.groups),
+                        turnover = zeros(mechanism.tree.groups);  // of each group [J]
+    std::vector<double> work = zeros(mechanism.tree.groups),
+                        lost = zeros(mechanism.tree.groups);  // of each group over the substep, and by friction [J]
+    std::vector<double> magnitude = zeros(mechanism.tree.groups);  // of each group, as in Trial
+    std::vector<double> share = zeros(n);
+    std::vector<double> diagonal = zeros(n);  // of the branch guard
     std::vector<double> curved, mass;  // (n, n) of the branch guard, unless the step equation is solved by elimination
     std::vector<PartLedger> part;      // at the trial node
 

@@ -13,17 +13,17 @@ namespace varpin {
 
 class KinematicInputs {
   public:
-    explicit KinematicInputs(const std::vector<DrivenRow>& driven)
-        : driven(driven), goal(driven.size()), goal_rate(driven.size()), begun(driven.size()) {
+    explicit KinematicInputs(const std::vector<DrivenRow>& driven) : driven(driven) {
         cubic = std::any_of(driven.begin(), driven.end(), [](const DrivenRow& own) { return own.rate >= 0; });
     }
 
     const std::vector<DrivenRow>& driven;
-    std::vector<double> goal;
-    std::vector<double> goal_rate, begun;  // rates at the goal and at the beginning of the part
-    bool cubic = false;                    // whether any is
-    int left = 1;                          // steps to the goal
-    double share = 1.0;                    // the next part's share of the time to the goal
+    std::vector<double> goal = zeros(count());
+    std::vector<double> goal_rate = zeros(count()),
+                        begun = zeros(count());  // rates at the goal and at the beginning of the part
+    bool cubic = false;                          // whether any is
+    int left = 1;                                // steps to the goal
+    double share = 1.0;                          // the next part's share of the time to the goal
 
     int count() const { return static_cast<int>(driven.size()); }
     // Index of the input of a row, or -1.

@@ -14,12 +14,12 @@ namespace varpin {
 
 class LinearStep {
   public:
-    LinearStep(int dof, int controls)
-        : J(2 * dof, 2 * dof + controls),
-          F(2 * dof, 2 * dof + controls),
-          jump(2 * dof),
-          x(2 * dof),
-          size(2 * dof + controls) {}
+    LinearStep(int dof, int controls) : x(2 * dof), size(2 * dof + controls) {}
+
+    const int x, size;
+    TiledMatrix J{x, size};  // [A B]
+    TiledMatrix F{x, size};  // of a process' jump
+    std::vector<double> jump = zeros(x);
 
     // Load step s: J.
     void load(const ExpandedSteps& steps, std::ptrdiff_t s) {
@@ -43,13 +43,6 @@ class LinearStep {
         }
         return depends;
     }
-
-    TiledMatrix J;             // (2n, 2n + m) [A B]
-    TiledMatrix F;             // (2n, 2n + m) of a process' jump
-    std::vector<double> jump;  // (2n)
-
-  private:
-    int x, size;
 };
 
 }  // namespace varpin

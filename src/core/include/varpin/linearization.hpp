@@ -33,17 +33,10 @@ class VariationalLinearization {
           state(mechanism, stages),
           from(n),
           from_p(n),
-          dV(entries(stages * n, 3 * n)),
-          dQ(entries(n, 3 * n)),
           chained(n, n),
-          in_ramp(entries(2 * n, 2 * n)),
-          multiplier(stages * n),
-          slope(stages * n),
           direction(mechanism.tree),
           at_q(n),
           at_v(n),
-          inner(entries(2 * n, 3 * n)),
-          df(entries(n, 3 * n)),
           at_f(n),
           along_q(n),
           along_v(n),
@@ -138,15 +131,15 @@ class VariationalLinearization {
     PathState state;
     std::vector<Coordinate> from;  // where the last part began
     std::vector<Compensated> from_p;
-    std::vector<double> dV;  // (s, n, 3n)
-    std::vector<double> dQ;  // (n, 3n) of one stage
+    std::vector<double> dV = zeros(stages * n, 3 * n);
+    std::vector<double> dQ = zeros(n, 3 * n);  // of one stage
     ChainedDerivatives chained;
-    std::vector<double> in_ramp;            // (2n, 2n) the derivatives in the state again, which nobody reads
-    std::vector<double> multiplier, slope;  // (s, n)
+    std::vector<double> in_ramp = zeros(2 * n, 2 * n);  // derivatives in the state again, which nobody reads
+    std::vector<double> multiplier = zeros(stages, n), slope = zeros(stages, n);
     Jet<Dual> direction;
     std::vector<Dual> at_q, at_v;
-    std::vector<double> inner;  // (2n, 3n)
-    std::vector<double> df;     // (n, 3n) of the force
+    std::vector<double> inner = zeros(2 * n, 3 * n);
+    std::vector<double> df = zeros(n, 3 * n);  // of the force
     std::vector<Dual> at_f;
     std::vector<Dual> coupled_q, coupled_v;                   // (n, n) of couplings, along a direction
     std::vector<JointForce<Dual>> along_q, along_v, along_f;  // (n) of the elements, with derivatives in q, in v, in f

@@ -10,6 +10,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "varpin/nodes.hpp"
 #include "varpin/tree.hpp"
 
 namespace varpin {
@@ -200,5 +201,61 @@ inline void diffusion_centers(const Mechanism& mechanism, const double* q, doubl
         }
     }
 }
+
+// What acts on P paths over N steps in addition to their commands; each may be null.
+struct Additions {
+    const double* increments = nullptr;  // (P, N, K) of the Wiener processes, K = increments_of_step
+    const double* drift = nullptr;       // (P, N, n) a force
+    const double* impulses = nullptr;    // (P, N, 2, n) before and after each step
+};
+
+// The inputs of one step; those that are not given are null.
+struct StepInputs {
+    std::int64_t path = 0, step = 0, row = 0;  // row = path N + step, of arrays (P, N, ...)
+    const double* u = nullptr;                 // (m)
+    const double* within = nullptr;            // (s, m) at the stages
+    Felt felt;
+    const double* increments = nullptr;  // (K)
+    const double* drift = nullptr;       // (n)
+    const double* impulses = nullptr;    // (2, n)
+};
+
+// How a path begins: whether it can, and its state, which commands see.
+struct Entry {
+    Outcome outcome = Outcome::solved;
+    const double *first = nullptr, *second = nullptr;  // (n)
+};
+
+// Advances paths, whatever their method.
+class PathDriver {
+  public:
+    // N steps of each path: begin(path) enters it, take(inputs) takes a step and records its node. A path that fails
+    // stops; nodes.ended and nodes.done hold the reason and the number of steps.
+    template <class Begin, class Take>
+    void roll(const Mechanism& mechanism, const Commands& commands, const Additions& more, int stages,
+              const Nodes& nodes, const Begin& begin, const Take& take) {
+        const int n = mechanism.dof(), m = mechanism.controls;
+        const std::int64_t width = increments_of_step(mechanism, commands);
+        for (std::int64_t path = 0; path < nodes.paths; ++path) {
+            double* u = nodes.u + path * nodes.steps * m;
+            auto [outcome, first, second] = begin(path);
+            nodes.done[path] = 0;
+            for (std::int64_t s = 0; s < nodes.steps && outcome == Outcome::solved; ++s) {
+                const std::int64_t row = path * nodes.steps + s;
+                apply_policy(commands, path, s, n, first, second, u);
+                const double* within = stage_controls(commands, path, s, stages, u, line_);
+                const Felt felt = more.increments ? felt_controls(commands, path, s, u, seen_) : Felt{};
+                outcome = take({path, s, row, u + s * m, within, felt, row_of(more.increments, row, width),
+                                row_of(more.drift, row, n), row_of(more.impulses, row, 2 * n)});
+                if (outcome == Outcome::solved) nodes.done[path] = s + 1;
+            }
+            nodes.ended[path] = static_cast<std::int64_t>(outcome);
+        }
+    }
+
+  private:
+    std::vector<double> line_;  // (s, m) linear controls at the stages
+    std::vector<double> seen_;  // (2, m) what the noise sees of them
+};
 
 }  // namespace varpin

@@ -75,23 +75,7 @@ class RootPass {
   public:
     // Starts from the terminal cost in x (2n), and its gradient.
     RootPass(int dof, int controls, const Squares& terminal, const double* terminal_gradient)
-        : n(dof),
-          m(controls),
-          x(2 * dof),
-          size(2 * dof + controls),
-          linear(size),
-          costate(size),
-          scale(size),
-          step(dof, controls),
-          before(size),
-          gradient(size),
-          terms(size),
-          control_norm(m),
-          weight(m),
-          Qu(m),
-          Ruu_k(m),
-          forced(m),
-          K(m * x) {
+        : n(dof), m(controls), x(2 * dof), size(2 * dof + controls), step(dof, controls) {
         root.reset(size + 1);
         for (int i = 0; i < x; ++i) {
             double* row = root.push();
@@ -359,22 +343,23 @@ class RootPass {
     int n, m, x, size;  // x = 2n states, and controls
     // The value: rows (R r) in (x, u), its linear part, and as in BackwardPass:
     RowStack root;
-    std::vector<double> linear;
-    std::vector<double> costate;
-    std::vector<double> scale;
+    std::vector<double> linear = zeros(size);
+    std::vector<double> costate = zeros(size);
+    std::vector<double> scale = zeros(size);
 
     // Work arrays of a step.
     LinearStep step;
-    RowStack stack;                // rows of the cost in (u, x)
-    RowStack noise_root;           // (., x) N
-    std::vector<double> before;    // (size) the next `linear`
-    std::vector<double> gradient;  // (size) the next costate
-    std::vector<double> terms;     // (size) the next scale
+    RowStack stack;                              // rows of the cost in (u, x)
+    RowStack noise_root;                         // (., x) N
+    std::vector<double> before = zeros(size);    // the next `linear`
+    std::vector<double> gradient = zeros(size);  // the next costate
+    std::vector<double> terms = zeros(size);     // the next scale
     // Work arrays of a decision.
-    RowStack firm;                             // regularized rows of the controls
-    std::vector<double> control_norm, weight;  // (m) norms of the controls' columns; regularization
-    std::vector<double> Qu;                    // gradient
-    std::vector<double> Ruu_k, forced, K;      // R_uu k; firm'^-1 linear; (m, x)
+    RowStack firm;  // regularized rows of the controls
+    std::vector<double> control_norm = zeros(m),
+                        weight = zeros(m);  // norms of the controls' columns; regularization
+    std::vector<double> Qu = zeros(m);      // gradient
+    std::vector<double> Ruu_k = zeros(m), forced = zeros(m), K = zeros(m, x);  // R_uu k; firm'^-1 linear; (m, x)
 };
 
 }  // namespace varpin

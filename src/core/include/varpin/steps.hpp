@@ -52,7 +52,8 @@ struct LinearizedPlan {
 };
 
 // The changes of the controls, each clipped to its limits, into `moves` (R, m), and the deviations of the state after
-// each step into `after` (N, 2n), of the linearized motion from the nominal state. True where a control reaches a limit.
+// each step into `after` (N, 2n), of the linearized motion from the nominal state. True where a control reaches a
+// limit.
 inline bool predict(const LinearizedPlan& plan, double* moves, double* after) {
     const int x = plan.states, m = plan.controls;
     const std::vector<double> start(x);

@@ -80,40 +80,35 @@ Outcome parts_again(std::span<const std::uint8_t> halvings, int most_halvings, c
 // Derivatives (2n, 2n) and (2n, n) of a step from those of its parts, `part` and `part_f`.
 class ChainedDerivatives {
   public:
-    explicit ChainedDerivatives(int n, int rates = 0)
-        : part(entries(2 * n, 2 * n)),
-          part_f(entries(2 * n, n)),
-          part_rate(entries(2 * n, rates)),
-          n_(n),
-          rates_(rates),
-          product_(part.size()) {}
+    explicit ChainedDerivatives(int n, int rates = 0) : n(n), rates(rates) {}
 
-    std::vector<double> part, part_f, part_rate;  // of the last part
+    const int n, rates;
+    std::vector<double> part = zeros(2 * n, 2 * n), part_f = zeros(2 * n, n);  // of the last part
+    std::vector<double> part_rate = zeros(2 * n, rates);
 
     // The derivatives of a step of zero length.
     void begin(double* Jx, double* Jf) const {
-        std::fill(Jx, Jx + 4 * n_ * n_, 0.0);
-        std::fill(Jf, Jf + 2 * n_ * n_, 0.0);
-        for (int i = 0; i < 2 * n_; ++i) Jx[i * 2 * n_ + i] = 1.0;
+        std::fill(Jx, Jx + 4 * n * n, 0.0);
+        std::fill(Jf, Jf + 2 * n * n, 0.0);
+        for (int i = 0; i < 2 * n; ++i) Jx[i * 2 * n + i] = 1.0;
     }
 
     // Multiply by the derivatives of the last part; follow_rates does so for derivatives in rates (2n, rates).
     void follow_rates(double* Jr) {
-        times(rates_, Jr);
-        for (int i = 0; i < 2 * n_ * rates_; ++i) Jr[i] += part_rate[i];
+        times(rates, Jr);
+        for (int i = 0; i < 2 * n * rates; ++i) Jr[i] += part_rate[i];
     }
     void follow(double* Jx, double* Jf) {
-        times(2 * n_, Jx);
-        times(n_, Jf);
-        for (int i = 0; i < 2 * n_ * n_; ++i) Jf[i] += part_f[i];
+        times(2 * n, Jx);
+        times(n, Jf);
+        for (int i = 0; i < 2 * n * n; ++i) Jf[i] += part_f[i];
     }
 
   private:
-    int n_, rates_;
-    std::vector<double> product_;
+    std::vector<double> product_ = zeros(2 * n, 2 * n);
 
     void times(int columns, double* right) {
-        const int x = 2 * n_;
+        const int x = 2 * n;
         std::fill(product_.begin(), product_.begin() + x * columns, 0.0);
         for (int i = 0; i < x; ++i) {
             for (int j = 0; j < x; ++j) {

@@ -27,13 +27,8 @@ class SymmetricElimination {
           order_(order),
           size_(size),
           width_(detail::even(size + order->mimics.slots)),
-          u_(width_),
-          row_(width_ * tree.size()),
-          answer_(width_ * tree.size()),
-          pivot_(tree.dof()),
           matrix_(order, width_ * width_),
-          force_(order, width_),
-          motion_(width_ * (tree.size() + 1)) {}
+          force_(order, width_) {}
 
     // To be written before body j is eliminated, (size) each: its row, and u0 plus the part of u from its own inertia.
     double* row(int j) { return row_.data() + width_ * j; }
@@ -157,11 +152,11 @@ class SymmetricElimination {
     std::shared_ptr<const SubtreeOrder> order_;
     int size_;
     Width width_;
-    std::vector<double> u_;
-    std::vector<double> row_, answer_;  // (b, width) row, and u / D
-    std::vector<double> pivot_;         // (n)
+    std::vector<double> u_ = zeros(width_);
+    std::vector<double> row_ = zeros(width_, tree_->size()), answer_ = zeros(width_, tree_->size());  // row, and u / D
+    std::vector<double> pivot_ = zeros(tree_->dof());
     detail::SubtreeSums matrix_, force_;
-    std::vector<double> motion_;  // (b + 1, width) of each body, after a zero for the base
+    std::vector<double> motion_ = zeros(width_, tree_->size() + 1);  // of each body, after a zero for the base
 };
 
 // The factors of M + diag(armature) at consecutive configurations: the articulated body algorithm (Featherstone 2008).

@@ -27,6 +27,11 @@ inline int entries(std::int64_t rows, std::int64_t columns) {
     return static_cast<int>(rows * columns);
 }
 
+// An array of zeros, or a matrix, as entries() allows.
+inline std::vector<double> zeros(std::int64_t rows, std::int64_t columns = 1) {
+    return std::vector<double>(entries(rows, columns));
+}
+
 // Coordinates [begin, end) of a diagonal block of M, L_vq and L_qq.
 struct Block {
     int begin = 0;

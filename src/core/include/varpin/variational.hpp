@@ -126,7 +126,8 @@ class VariationalStepper {
     int n;
     int m;  // rows of constraints
     int stages;
-    std::vector<double> force;           // (n) constant over the step, or (s, n) at the stages of the step or its part
+    std::vector<double> force =
+        zeros(stages, n);                // constant over the step, or (s, n) at the stages of the step or its part
     int stride = 0;                      // distance of rows of `force`; 0 for a constant
     const double* outer = nullptr;       // (n) external force, null for none
     Effort effort;                       // of the last step
@@ -235,57 +236,20 @@ class VariationalStepper {
         return attempt(h, state, true);
     }
 
-    // Advances every path by N steps. Writes the node after each step, its controls and its statistics into `nodes`. A
-    // path that fails stops; nodes.ended and nodes.done hold the reason and the number of steps. These may be null:
-    // `increments` of the Wiener processes (P, N, K) with K = increments_of_step, `drift`, a force in addition to the
-    // controls (P, N, n), and `impulses` in addition to the noise, before and after each step, or held over it as the
-    // noise (P, N, 2, n).
-    void roll(double h, const Commands& commands, const double* increments, const double* drift, const double* impulses,
-              std::vector<PathState>& states, const Nodes& nodes) {
-        const std::int64_t steps = nodes.steps;
-        const int controls = mechanism.controls;
-        const std::int64_t width = increments_of_step(mechanism, commands);
-        const bool noisy = increments != nullptr && width > 0;
-        const bool kicks = noisy && !held;
-        const double *pushes = held ? nullptr : impulses, *spread = held ? impulses : nullptr;
-        for (std::int64_t path = 0; path < nodes.paths; ++path) {
+    // Advances every path by N steps of length h; impulses in addition to the noise act before and after each step, or
+    // are held over it as the noise.
+    void roll(double h, const Commands& commands, const Additions& more, std::vector<PathState>& states,
+              const Nodes& nodes) {
+        const auto begin = [&](std::int64_t path) {
             PathState& state = states[path];
-            double* u = nodes.u + path * steps * controls;
-            const bool regular = factor_at(state);
             state.halvings.clear();
             state.impulses.clear();
-            state.impulses.reserve(steps * m);
-            nodes.ended[path] = static_cast<std::int64_t>(regular ? Outcome::solved : Outcome::singular);
-            nodes.done[path] = 0;
-            if (!regular) continue;
-            for (std::int64_t s = 0; s < steps; ++s) {
-                const std::int64_t row = path * steps + s;
-                const double* dw = noisy ? increments + row * width : nullptr;
-                apply_policy(commands, path, s, n, state.q.data(), state.momentum.data(), u);
-                const Felt felt = noisy ? felt_controls(commands, path, s, u, seen) : Felt{};
-                if (kicks) noise_kick(left, felt, dw, state);
-                if (pushes) kick(pushes + 2 * row * n, state);
-                const double* within = stage_controls(commands, path, s, stages, u, line);
-                const Extra extra =
-                    held_noise(mechanism, h, row_of(drift, row, n), row_of(spread, row, 2 * n), state.q.data(),
-                               state.center.data(), felt, held ? dw : nullptr, extras.data());
-                outer = extra.external;
-                stride = within ? n : 0;
-                constant_force(mechanism, extra.driven, u + s * controls, force.data());
-                if (within) stage_forces(mechanism, extra.driven, within, stages, given.data());
-                take_goals(commands.hold - static_cast<int>(s % commands.hold), u + s * controls);
-                const Outcome outcome = step(h, state);
-                record_effort(effort, nodes, row);
-                nodes.ended[path] = static_cast<std::int64_t>(outcome);
-                if (outcome != Outcome::solved) break;
-                state.halvings.insert(state.halvings.end(), halvings.begin(), halvings.end());
-                state.impulses.insert(state.impulses.end(), state.impulse.begin(), state.impulse.end());
-                if (kicks && left < 1.0) noise_kick(1.0 - left, felt, dw, state);
-                if (pushes) kick(pushes + (2 * row + 1) * n, state);
-                record_node(state, n, nodes, row);
-                nodes.done[path] = s + 1;
-            }
-        }
+            state.impulses.reserve(nodes.steps * m);
+            const Outcome outcome = factor_at(state) ? Outcome::solved : Outcome::singular;
+            return Entry{outcome, state.q.data(), state.momentum.data()};
+        };
+        driver.roll(mechanism, commands, more, stages, nodes, begin,
+                    [&](const StepInputs& in) { return noisy_step(h, commands.hold, in, states[in.path], nodes); });
         outer = nullptr;
     }
 
@@ -311,16 +275,7 @@ class VariationalStepper {
           n(mechanism.dof()),
           m(rows),
           stages(tableau.stages),
-          force(stages * n),
-          trial(n),
-          given(stages * n),
-          impulse(stages * m),
-          pushed(m > 0 ? stages * n : 0),
-          push_size(pushed.size()),
-          at(n),
-          guess(stages * n),
-          bend(2 * n),
-          extras(n) {}
+          trial(n) {}
 
     // What differs under constraints.
 
@@ -361,17 +316,17 @@ class VariationalStepper {
     }
 
     Trial trial;
-    std::vector<double> given;              // (s, n) varying force at the stages of the whole step
-    std::vector<double> impulse;            // (s, m) Lam_k of the constraints, zero for omitted rows
-    std::vector<double> pushed, push_size;  // (s, n) C_k' Lam_k and the size of its terms; empty without constraints
-    std::vector<double> at;                 // (n)
+    std::vector<double> given = zeros(stages, n);    // varying force at the stages of the whole step
+    std::vector<double> impulse = zeros(stages, m);  // Lam_k of the constraints, zero for omitted rows
+    // C_k' Lam_k and the size of its terms; empty without constraints
+    std::vector<double> pushed = zeros(m > 0 ? stages * n : 0), push_size = pushed;
+    std::vector<double> at = zeros(n);
 
   private:
-    std::vector<double> line;    // (s, m) linear controls at these stages
-    std::vector<double> seen;    // (2, m) what the noise sees of them
-    std::vector<double> guess;   // (s, n) extrapolated stage velocities
-    std::vector<double> bend;    // (2, n)
-    std::vector<double> extras;  // (n) forces in addition to the controls
+    PathDriver driver;
+    std::vector<double> guess = zeros(stages, n);  // extrapolated stage velocities
+    std::vector<double> bend = zeros(2, n);
+    std::vector<double> extras = zeros(n);  // forces in addition to the controls
 
     // The force on coordinate c, without those of elements, if it is constant over the step.
     double constant(int c) const { return outer ? force[c] + outer[c] : force[c]; }
@@ -484,6 +439,30 @@ class VariationalStepper {
         std::copy(state.v.begin(), state.v.end(), state.past_end.begin());
         for (int c = 0; c < n; ++c) state.past_force[c] = constant(c);
         state.known = std::min(state.known + 1, PathState::most_misses + 1);
+    }
+
+    // A step with its controls and noise, and its node.
+    Outcome noisy_step(double h, int hold, const StepInputs& in, PathState& state, const Nodes& nodes) {
+        const bool kicks = in.increments && !held;
+        const double* const pushes = held ? nullptr : in.impulses;
+        if (kicks) noise_kick(left, in.felt, in.increments, state);
+        if (pushes) kick(pushes, state);
+        const Extra extra = held_noise(mechanism, h, in.drift, held ? in.impulses : nullptr, state.q.data(),
+                                       state.center.data(), in.felt, held ? in.increments : nullptr, extras.data());
+        outer = extra.external;
+        stride = in.within ? n : 0;
+        constant_force(mechanism, extra.driven, in.u, force.data());
+        if (in.within) stage_forces(mechanism, extra.driven, in.within, stages, given.data());
+        take_goals(hold - static_cast<int>(in.step % hold), in.u);
+        const Outcome outcome = step(h, state);
+        record_effort(effort, nodes, in.row);
+        if (outcome != Outcome::solved) return outcome;
+        state.halvings.insert(state.halvings.end(), halvings.begin(), halvings.end());
+        state.impulses.insert(state.impulses.end(), state.impulse.begin(), state.impulse.end());
+        if (kicks && left < 1.0) noise_kick(1.0 - left, in.felt, in.increments, state);
+        if (pushes) kick(pushes + n, state);
+        record_node(state, n, nodes, in.row);
+        return outcome;
     }
 
     // The impulse of `part` of the increments dw, (N2).

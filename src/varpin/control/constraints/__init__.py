@@ -3,9 +3,6 @@
 from varpin.control.constraints.base import BoundConstraint as BoundConstraint
 from varpin.control.constraints.base import Horizon as Horizon
 from varpin.control.constraints.base import PlanConstraint as PlanConstraint
-from varpin.control.constraints.base import Slopes as Slopes
-from varpin.control.constraints.between import BoundBetween as BoundBetween
-from varpin.control.constraints.between import BoundOnCubics as BoundOnCubics
 from varpin.control.constraints.clearance import KeepClear as KeepClear
 from varpin.control.constraints.frames import KeepInBox as KeepInBox
 from varpin.control.constraints.frames import KeepInHalfSpace as KeepInHalfSpace

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
@@ -53,14 +53,6 @@ class Horizon(Frozen):
     def places(self) -> tuple[Integers, Floats]:
         """All nodes but the first, whose state is given, and their times."""
         return np.arange(1, self.steps + 1), self.t[1:]
-
-
-class Slopes(NamedTuple):
-    """Derivatives of a constraint's rows in the states of nodes and the controls of the steps after them."""
-
-    nodes: Integers  # (K,)
-    by_state: Floats  # (K, rows, 2n) in (q, v) at the node
-    by_controls: Floats  # (K, rows, c) in the step's control, c = m, or in those at its ends, 2m; c = 0 for neither
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,14 +100,6 @@ class BoundConstraint(Frozen, ABC):
             NotImplementedError: The constraint is on controls.
         """
         raise NotImplementedError
-
-    def slopes(self, q: Floats, v: Floats, u: Floats) -> Slopes:  # noqa: ARG002
-        """The derivatives of the rows along one motion, whose arguments are those of :meth:`value`.
-
-        Raises:
-            NotImplementedError: The constraint is on controls.
-        """
-        return Slopes(self.places, self.jacobian(q, v), np.zeros((*self.shape, 0)))
 
 
 class PlanConstraint(Frozen, ABC):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +21,7 @@ from varpin.errors import InputError
 from varpin.model import Robot, require_robot
 from varpin.model.clearance import Clearance, Obstacle, clearance
 from varpin.model.kinematics import require_same
-from varpin.support.checks import finite, flag, path_like
+from varpin.support.checks import finite, flag, path_like, tuple_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,22 +85,17 @@ class KeepClear(PlanConstraint):
                 a value is invalid.
         """
         self.robot = require_robot(robot, type(self).__name__)
-        if not isinstance(obstacles, Iterable) or not all(isinstance(item, Obstacle) for item in obstacles):
-            raise InputError(f"KeepClear obstacles must be a list of varpin.Obstacle, got {obstacles!r}")
-        self.obstacles = tuple(obstacles)
+        self.obstacles = tuple_of("obstacles", obstacles, Obstacle)
         self.distance = finite("KeepClear distance", distance)
         self.margin = checked_margin(self, margin)
         itself = flag("KeepClear itself", itself)
-        if links is not None and (
-            isinstance(links, str) or not isinstance(links, Iterable) or not all(isinstance(x, str) for x in links)
-        ):
-            raise InputError(f"KeepClear links must be a list of names of links, got {links!r}")
+        names = None if links is None else tuple_of("names of links", links, str)
         if not (capsules is None or isinstance(capsules, Mapping)):
             raise InputError(f"KeepClear capsules must map names of links to (begin, end, radius), got {capsules!r}")
         file = None if srdf is None else path_like("KeepClear srdf", srdf)
         if file is not None and not itself:
             raise InputError("KeepClear srdf leaves out pairs of links, and there are none without itself=True")
-        self._of = clearance(robot, self.obstacles, links=links, itself=itself, srdf=file, capsules=capsules)
+        self._of = clearance(robot, self.obstacles, links=names, itself=itself, srdf=file, capsules=capsules)
         self.pairs = self._of.names
         self.capsules = {
             name: (begin.tolist(), end.tolist(), radius) for name, (begin, end, radius) in self._of.capsules.items()

@@ -221,18 +221,11 @@ class KeepInBox(_WithinPlanes):
     """lower <= p(q) <= upper at every node after the first: a frame's origin stays in a box along the world's axes."""
 
     def __init__(self, robot: Robot, frame: str, lower: ArrayLike, upper: ArrayLike, *, margin: float = 0.0) -> None:
-        """Describe the constraint.
+        """Describe the constraint; see :class:`KeepInHalfSpace`.
 
         Args:
-            robot: The robot.
-            frame: Name of the frame.
             lower: One number or (3,) in the world, infinite where there is no limit [m].
             upper: Likewise.
-            margin: In standard deviations of the distance under noise.
-
-        Raises:
-            UnknownFrame: The robot has no such frame.
-            InputError: The frame is fixed to the base, or the box is empty or has no finite side.
         """
         self._take(robot, frame)
         self.limits = checked_limits("KeepInBox", (lower, upper), 3)
@@ -261,18 +254,11 @@ class _OfSphere(_Region):
         *,
         margin: float = 0.0,
     ) -> None:
-        """Describe the constraint.
+        """Describe the constraint; see :class:`KeepInHalfSpace`.
 
         Args:
-            robot: The robot.
-            frame: Name of the frame.
             center: Centre in the world (3,) [m], or a function of time [s] that returns it.
             radius: Radius [m].
-            margin: In standard deviations of the distance under noise.
-
-        Raises:
-            UnknownFrame: The robot has no such frame.
-            InputError: The frame is fixed to the base, or centre or radius are invalid.
         """
         self._take(robot, frame)
         name = type(self).__name__

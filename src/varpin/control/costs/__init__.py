@@ -8,13 +8,13 @@ from varpin.control.costs.base import CostSum as CostSum
 from varpin.control.costs.base import Expansion as Expansion
 from varpin.control.costs.base import Points as Points
 from varpin.control.costs.base import Terminal as Terminal
+from varpin.control.costs.base import weight_matrix as weight_matrix
 from varpin.control.costs.custom import CustomCost as CustomCost
 from varpin.control.costs.joints import ControlCost as ControlCost
 from varpin.control.costs.joints import JointLimitBarrier as JointLimitBarrier
 from varpin.control.costs.joints import TrackingCost as TrackingCost
 from varpin.control.costs.joints import VelocityCost as VelocityCost
 from varpin.control.costs.joints import VelocityLimitBarrier as VelocityLimitBarrier
-from varpin.control.costs.least_squares import weight_matrix as weight_matrix
 from varpin.control.costs.rate import ControlRate as ControlRate
 from varpin.control.costs.rate import ControlRateCost as ControlRateCost
 from varpin.control.costs.rate import control_rate as control_rate

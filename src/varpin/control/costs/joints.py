@@ -7,9 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.costs.base import BoundCost, BoundTerm, Points
-from varpin.control.costs.least_squares import (
+from varpin.control.costs.base import (
+    BoundCost,
+    BoundTerm,
     LeastSquares,
+    Points,
     ReferenceValues,
     checked_reference,
     checked_weight,

@@ -8,8 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.costs.base import BoundCost, Cost, CostSum, Points
-from varpin.control.costs.least_squares import LeastSquares, checked_weight, plain, weight_matrix
+from varpin.control.costs.base import (
+    BoundCost,
+    Cost,
+    CostSum,
+    LeastSquares,
+    Points,
+    checked_weight,
+    plain,
+    weight_matrix,
+)
 from varpin.errors import InputError
 from varpin.support.checks import JointValues, as_floats, control_array, control_values
 from varpin.support.frozen import Frozen
@@ -58,7 +66,7 @@ class ControlRateCost(LeastSquares):
 
 @dataclass(frozen=True, eq=False)
 class ControlRate(Frozen):
-    """The total cost of control changes.
+    """The total cost of control changes, (O5).
 
     Attributes:
         weight: (m, m).

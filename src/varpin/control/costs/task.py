@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
-from varpin.control.costs.base import BoundTerm, CostError, Points
-from varpin.control.costs.least_squares import (
+from varpin.control.costs.base import (
+    BoundTerm,
+    CostError,
     LeastSquares,
+    Points,
     ReferenceValues,
     checked_reference,
     checked_weight,

@@ -14,7 +14,7 @@ from varpin.arrays import Floats
 from varpin.model import Robot
 from varpin.show.replay.marks import Figure, Mark, Region, samples, translation
 from varpin.show.replay.picture import Picture, label
-from varpin.show.replay.shapes import ShapeLoader
+from varpin.show.replay.shapes import Style, load_shape
 from varpin.show.replay.view import across, set_view, side_by_side, view_direction
 
 # Part of a region that is shown around the rest, relative to the size of a robot's motion.
@@ -103,7 +103,6 @@ class _Drawing:
     def __init__(self, viewer: meshcat.Visualizer, script: Script) -> None:
         self.viewer = viewer
         self.script = script
-        self.loader = ShapeLoader(viewer)
         self.clips: dict[meshcat.path.Path, AnimationClip] = {}
         robots = {id(actor.robot): actor.robot for actor in script.actors}
         self.pictures = {key: Picture.of(robot) for key, robot in robots.items()}
@@ -165,14 +164,13 @@ class _Drawing:
             shapes = zip(picture.shapes, picture.meshes, picture.bodies, picture.placements, strict=True)
             for k, (shape, parts, body, placement) in enumerate(shapes):
                 node = f"{nodes[body] if body >= 0 else f'{root}/base'}/shapes/{k} {label(shape.name)}"
-                if kind == "ghost":
-                    if body >= 0:
-                        self.loader.load_ghost(shape, parts, placement, node)
-                elif actor.effort is not None and body >= 0:
-                    self.loader.load_plain(shape, parts, placement, node)
-                    self._color(f"{node}/<object>", actor.effort[:, body])
-                else:
-                    self.loader.load(shape, parts, placement, node)
+                if kind == "ghost" and body < 0:
+                    continue
+                shares = None if kind == "ghost" or body < 0 or actor.effort is None else actor.effort[:, body]
+                style: Style = "ghost" if kind == "ghost" else "own" if shares is None else "plain"
+                load_shape(self.viewer, shape, parts, placement, node, style)
+                if shares is not None:
+                    self._color(f"{node}/<object>", shares)
 
     def _color(self, node: str, shares: Floats) -> None:
         stops = np.linspace(0.0, 1.0, len(EFFORT_COLORS))

@@ -6,12 +6,12 @@ import logging
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import meshcat
 import numpy as np
 import pinocchio as pin
-from meshcat.geometry import MeshPhongMaterial
+from meshcat.geometry import Geometry, MeshPhongMaterial
 from numpy.typing import ArrayLike
 from pinocchio.visualize.meshcat_visualizer import MeshcatVisualizer
 
@@ -19,82 +19,82 @@ from varpin.arrays import Floats
 from varpin.model.meshes import MeshPart, joined
 from varpin.show.replay.marks import GHOST_COLOR
 
+Style: TypeAlias = Literal["own", "plain", "ghost"]
+
 logger = logging.getLogger(__name__)
 
-_GHOST_OPACITY = 0.35
 _WHITE = (1.0, 1.0, 1.0)
 # three.js's constant RepeatWrapping, for textures that repeat beyond their edges.
 _REPEAT = 1000
+# A polygon offset draws the robot in front where both coincide, except for facets of a rotated sphere; without it they
+# would flicker.
+_GHOST: dict[str, Any] = {
+    "color": GHOST_COLOR,
+    "opacity": 0.35,
+    "transparent": True,
+    "polygonOffset": True,
+    "polygonOffsetFactor": 2.0,
+    "polygonOffsetUnits": 64.0,
+}
 
 
-class ShapeLoader:
-    """Sends shapes to a viewer: meshes part by part, other shapes in the forms of Pinocchio's own viewer."""
+def load_shape(
+    viewer: meshcat.Visualizer,
+    shape: pin.GeometryObject,
+    parts: Sequence[MeshPart],
+    placement: pin.SE3,
+    node: str,
+    style: Style,
+) -> None:
+    """Send a shape, with the parts of its mesh if it is one, and its placement in the parent node.
 
-    def __init__(self, viewer: meshcat.Visualizer) -> None:
-        self.viewer = viewer
-        self.forms = MeshcatVisualizer()
-
-    def load(self, shape: pin.GeometryObject, parts: Sequence[MeshPart], placement: pin.SE3, node: str) -> None:
-        """Send a shape, with the parts of its mesh if it is one, and its placement in the parent node."""
+    In its own colours, part by part; plain, as one object in one colour that can be animated; or as the ghost's.
+    """
+    if style == "own" and parts:
         for k, part in enumerate(parts):
-            # As in RViz, and in meshcat, a Collada file's materials prevail over the description's.
-            given = shape.overrideMaterial and (part.color is None or not shape.meshPath.lower().endswith(".dae"))
-            color = shape.meshColor if given or part.color is None else part.color
-            look: dict[str, Any] = {"flatShading": part.normals is None, "opacity": float(color[3])}
-            if not given:
-                look |= {name: value if np.isscalar(value) else _hex(value) for name, value in part.shine.items()}
-            if part.colors is not None and part.color is None and not given:
-                color, look["vertexColors"] = _WHITE, True
-            texture = shape.meshTexturePath or ("" if given else part.texture)
-            if texture and part.uv is not None:
-                color, look["map"] = _WHITE, _picture(texture)
-            path = node if len(parts) == 1 else f"{node}/{k}"
-            self.viewer[path].set_object(_Triangles(part), MeshPhongMaterial(color=_hex(color), **look))
-        if parts:
-            self.viewer[node].set_transform(placement.homogeneous)
+            viewer[node if len(parts) == 1 else f"{node}/{k}"].set_object(_Triangles(part), _material(shape, part))
+    else:
+        if style == "ghost":
+            look = _GHOST | {"flatShading": bool(parts)}
+        else:
+            look = {"color": _hex(shape.meshColor), "opacity": float(shape.meshColor[3]), "flatShading": bool(parts)}
+        if style == "own" and shape.meshTexturePath:
+            look |= {"color": _hex(_WHITE), "map": _picture(shape.meshTexturePath)}
+        form = _Triangles(joined(parts)) if parts else _primitive(shape)
+        if form is None:
             return
-        look = {"color": _hex(shape.meshColor)}
-        if shape.meshTexturePath:
-            look = {"color": _hex(_WHITE), "map": _picture(shape.meshTexturePath)}
-        opacity = float(shape.meshColor[3])
-        material = MeshPhongMaterial(opacity=opacity, **look)
-        if problem := self._send(shape, parts, placement, node, material):
-            logger.warning("%s; it is not drawn", problem)
-
-    def load_plain(self, shape: pin.GeometryObject, parts: Sequence[MeshPart], placement: pin.SE3, node: str) -> None:
-        """Send a shape as one object in one colour, which can be animated."""
-        material = MeshPhongMaterial(color=_hex(shape.meshColor), flatShading=True)
-        if problem := self._send(shape, parts, placement, node, material):
-            logger.warning("%s; it is not drawn", problem)
-
-    def load_ghost(self, shape: pin.GeometryObject, parts: Sequence[MeshPart], placement: pin.SE3, node: str) -> None:
-        """Send a shape in the ghost's colour.
-
-        A polygon offset draws the robot in front where both coincide, except for facets of a rotated sphere; without it
-        they would flicker.
-        """
-        material = MeshPhongMaterial(
-            color=GHOST_COLOR, opacity=_GHOST_OPACITY, transparent=True, polygonOffset=True,
-            polygonOffsetFactor=2.0, polygonOffsetUnits=64.0, flatShading=bool(parts),
-        )  # fmt: skip
-        # What cannot be drawn was logged when the robot's own shape was loaded.
-        self._send(shape, parts, placement, node, material)
-
-    def _send(
-        self, shape: pin.GeometryObject, parts: Sequence[MeshPart], placement: pin.SE3, node: str, material: Any
-    ) -> str:
-        """Send a shape as one object in a material; returns why it cannot be drawn, or nothing."""
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            form = _Triangles(joined(parts)) if parts else self.forms.loadPrimitive(shape)
-        if not isinstance(form, meshcat.geometry.Geometry):
-            return " ".join(str(warning.message) for warning in caught) or f"shape {shape.name!r} has no form"
-        self.viewer[node].set_object(form, material)
-        self.viewer[node].set_transform(placement.homogeneous)
-        return ""
+        viewer[node].set_object(form, MeshPhongMaterial(**look))
+    viewer[node].set_transform(placement.homogeneous)
 
 
-class _Triangles(meshcat.geometry.Geometry):
+def _material(shape: pin.GeometryObject, part: MeshPart) -> MeshPhongMaterial:
+    """The look of a part of a mesh: as in RViz, a Collada file's materials prevail over the description's."""
+    given = shape.overrideMaterial and (part.color is None or not shape.meshPath.lower().endswith(".dae"))
+    color = shape.meshColor if given or part.color is None else part.color
+    look: dict[str, Any] = {"flatShading": part.normals is None, "opacity": float(color[3])}
+    if not given:
+        look |= {name: value if np.isscalar(value) else _hex(value) for name, value in part.shine.items()}
+    if part.colors is not None and part.color is None and not given:
+        color, look["vertexColors"] = _WHITE, True
+    texture = shape.meshTexturePath or ("" if given else part.texture)
+    if texture and part.uv is not None:
+        color, look["map"] = _WHITE, _picture(texture)
+    return MeshPhongMaterial(color=_hex(color), **look)
+
+
+def _primitive(shape: pin.GeometryObject) -> Geometry | None:
+    """The form of Pinocchio's own viewer; None, with a warning, if there is none."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        form = MeshcatVisualizer().loadPrimitive(shape)
+    if isinstance(form, Geometry):
+        return form
+    problem = " ".join(str(warning.message) for warning in caught) or f"shape {shape.name!r} has no form"
+    logger.warning("%s; it is not drawn", problem)
+    return None
+
+
+class _Triangles(Geometry):
     """The triangles of a part of a mesh."""
 
     def __init__(self, part: MeshPart) -> None:
