@@ -219,7 +219,7 @@ def test_stops_ends_and_servos_are_said():
     cost = vp.ControlCost(1e-2) + vp.Terminal(vp.TrackingCost([1.0, 0.5], 50.0))
     plan = vp.solve(vp.OptimalControlProblem(vp.Scene(chain, damping=0.1), cost, [0, 0], [0, 0], dt=0.02, steps=30))
     served = vp.Scene(chain, damping=0.1, forces=servos)
-    with refused(vp.InputError, "positions", "forces"):
+    with refused(vp.InputError, "servos", "no joint", "joint1, joint2"):
         vp.simulate(served, [0, 0], [0, 0], dt=0.02, steps=30, controls=plan.policy, integrator=vp.Gauss(4))
     with refused(vp.InputError, "joint1", "joint2"):
         vp.Mpc(plan.problem).run(vp.Plant(served), duration=0.1)

@@ -384,7 +384,7 @@ def noise_of_step(
 ) -> Floats:
     """The impulse (n,) of increments dw (K,) at a state, by fields in Python, F (n, k) of the mean control.
 
-    ``ends`` (1, m) are the controls at both ends of the step, ``start`` (n,) is the configuration at the motion's start.
+    ``ends`` (1, m) are the controls at both ends of the step, ``start`` (n,) is the first configuration of the motion.
     """
     k = scene.processes
     impulse: Floats = F @ dw[:k]

@@ -47,8 +47,8 @@ def commands_of(scene: Scene, integrator: Method, controls: Controls, steps: int
             ("servos", controls.servos, scene.servo_joints),
         ):
             if own is not None and own != of_scene:
-                named = (", ".join(joints or ("no single joints",)) for joints in (own, of_scene))
-                raise InputError("the policy's {} are of {}, the scene's of {}".format(what, *named))
+                theirs, ours = (", ".join(joints or ()) or "no joint" for joints in (own, of_scene))
+                raise InputError(f"the policy's {what} are of {theirs}, the scene's of {ours}")
         return controls.commands(
             steps, scene.controls, scene.robot.dof, integrator.variational, dt, integrator.stage_times
         )

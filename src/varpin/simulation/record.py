@@ -162,8 +162,8 @@ def trajectory_of(
 ) -> Trajectory:
     """The motion from a first node through consecutive segments; increments ``dw`` (N, k), None for zeros.
 
-    ``within`` are the controls at the stages (N, s, m), None for constant ones; ``on`` the commands of the whole motion,
-    where its controls are linear between nodes.
+    ``within`` are the controls at the stages (N, s, m), None for constant ones; ``on`` the commands of the whole
+    motion, where its controls are linear between nodes.
     """
     steps = join(parts) if len(parts) > 1 else parts[0] if parts else first.part(0)
     N = len(steps.u)
@@ -289,8 +289,8 @@ class Motions:
     ) -> tuple[Trajectory, Failure | None]:
         """The motion under commands of all its steps, unchecked, and the failure that stopped it early, if any.
 
-        ``increments`` are (N, k) [s^0.5], left out for no noise; ``integrator`` is the integrator with another guard. Raises
-        a ForceError or ConstraintError if a function failed.
+        ``increments`` are (N, k) [s^0.5], left out for no noise; ``integrator`` is the integrator with another guard.
+        Raises a ForceError or ConstraintError if a function failed.
         """
         drawn = np.zeros((0, 0, self.scene.processes)) if increments is None else increments[None]
         own = integrator or self.integrator
