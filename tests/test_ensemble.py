@@ -31,27 +31,17 @@ def same_statistics(one, other, tolerance=0.0):
         np.testing.assert_allclose(a, b, rtol=0, atol=tolerance, equal_nan=True)
 
 
-def blocks_of(monkeypatch, numbers):
-    monkeypatch.setattr(varpin.ensemble.paths, "_BLOCK", numbers)
-
-
-def numbers_a_step(scene, paths):
-    return paths * (2 * scene.robot.dof + 1)
-
-
 @pytest.mark.parametrize("kick", ["left", "split"])
-def test_same_bytes_for_any_number_of_workers_and_blocks(kick, monkeypatch):
+def test_same_bytes_for_any_number_of_workers(kick):
     integrator, calls = vp.Midpoint(kick=kick), []
     one, two = (run(paths=200, workers=w, integrator=integrator) for w in (1, 2))
     seven = run(paths=200, workers=7, integrator=integrator, progress=lambda *done: calls.append(done))
     # 4000 steps, twice as many, and then 96 paths.
     assert calls == [(80, 200), (176, 200), (200, 200)]
-    blocks_of(monkeypatch, 9 * numbers_a_step(make_scene(), 96))
-    in_blocks = run(paths=200, workers=2, integrator=integrator)
-    for other in (two, seven, in_blocks):
+    for other in (two, seven):
         for name in ARRAYS:
             assert getattr(other, name).tobytes() == getattr(one, name).tobytes()
-        same_statistics(other, one, 1e-14 if other is in_blocks else 0.0)
+        same_statistics(other, one)
 
 
 def test_same_bytes_for_one_path_or_a_thousand():
@@ -130,13 +120,10 @@ def test_statistics_are_those_of_the_stored_paths():
     assert run(quantiles=[]).statistics.quantiles.shape == (0, 51, 4)
 
 
-def test_statistics_do_not_need_stored_paths(monkeypatch):
-    stored = run()
-    for _ in range(2):
-        lean = run(store=False)
-        assert all(getattr(lean, name) is None for name in ARRAYS)
-        same_statistics(lean, stored, 1e-14)
-        blocks_of(monkeypatch, 7 * numbers_a_step(make_scene(), 40))
+def test_statistics_do_not_need_stored_paths():
+    lean = run(store=False)
+    assert all(getattr(lean, name) is None for name in ARRAYS)
+    same_statistics(lean, run())
 
 
 def test_one_path_has_no_covariance():
@@ -214,7 +201,7 @@ def starts(paths):
     return q0
 
 
-def test_failing_paths_are_left_out_from_where_they_fail(monkeypatch, caplog):
+def test_failing_paths_are_left_out_from_where_they_fail(caplog):
     options = FRAGILE | {"paths": 40, "q0": starts(40), "v0": np.zeros(3)}
     with caplog.at_level(logging.WARNING, "varpin.ensemble"):
         end = run(fragile_scene(), **options)
@@ -242,12 +229,6 @@ def test_failing_paths_are_left_out_from_where_they_fail(monkeypatch, caplog):
             assert caught.value.trajectory.p.tobytes() == end.p[path, : done + 1].tobytes()
     assert end.statistics.count.tolist() == [40 - sum(step < j for step in steps.values()) for j in range(61)]
     check_statistics(end)
-    # A path that has failed is not taken up again in the next block.
-    blocks_of(monkeypatch, 4 * numbers_a_step(fragile_scene(), 40))
-    again = run(fragile_scene(), **options)
-    assert {failure.path: failure for failure in again.failures} == failed
-    assert again.p.tobytes() == end.p.tobytes()
-    same_statistics(again, end, 1e-13)
     same_statistics(run(fragile_scene(), store=False, **options), end, 1e-13)
 
 

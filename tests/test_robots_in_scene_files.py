@@ -101,31 +101,18 @@ def test_joints_that_nothing_touches_are_left_out_of_each_robot(tmp_path):
     np.testing.assert_allclose(file.simulate().q, whole.simulate().q[:, own], atol=1e-12)
 
 
-MISTAKES = {
-    "one robot": (
-        TWO.split("[[robot]]", maxsplit=1)[0] + "[[robot]]\n" + TWO.split("[[robot]]")[2],
-        "robot",
-        "two robots or more",
-    ),
-    "names twice": (TWO.replace('prefix = "right_"', 'prefix = "left_"'), "robot[1].prefix", "'left_dip'"),
-    "no prefix": (TWO.replace('prefix = "right_"\n', "").replace('prefix = "left_"\n', ""), "robot[1].prefix", "'dip'"),
-    "unknown key": (TWO.replace("prefix = ", "prefx = ", 1), "robot[0].prefx", ""),
-    "unknown robot": (TWO.replace('"finger"\nprefix = "right_"', '"fingr"\nprefix = "right_"'), "robot[1].source", ""),
-    "unknown joint locked": (TWO.replace("dip = 0.2 }", "dop = 0.2 }"), "robot[0].lock.dop", "dip"),
-    "unknown frame": (TWO.replace('"tip"', '"tipp"'), "robot[0].payload[0].frame", "tip"),
-    "locked in degrees": (TWO.replace("dip = 0.2 }", "dip = 20 }"), "robot[0].lock.dip", "degrees"),
-    "prefix of one": (
-        '[robot]\nsource = "finger"\nprefix = "a_"\n[horizon]\ndt = 1e-3\nsteps = 1\n',
-        "robot.prefix",
-        "",
-    ),
-    "own name": (TWO.replace('"left_mcp", "right_mcp"', '"mcp"'), "actuation.joints[0]", "left_mcp"),
-}
+MISTAKES = [
+    (TWO.replace(TWO.split("[[robot]]")[1], "").replace("[[robot]]", "", 1), "robot", "two robots or more"),
+    (TWO.replace('prefix = "right_"', 'prefix = "left_"'), "robot[1].prefix", "'left_dip'"),
+    (TWO.replace("prefix = ", "prefx = ", 1), "robot[0].prefx", ""),
+    (TWO.replace("dip = 0.2 }", "dop = 0.2 }"), "robot[0].lock.dop", "dip"),
+    (TWO.replace('"tip"', '"tipp"'), "robot[0].payload[0].frame", "tip"),
+    (TWO.replace('"left_mcp", "right_mcp"', '"mcp"'), "actuation.joints[0]", "left_mcp"),
+]
 
 
-@pytest.mark.parametrize("what", MISTAKES)
-def test_mistakes_name_the_robot(tmp_path, what):
-    text, key, words = MISTAKES[what]
+@pytest.mark.parametrize(("text", "key", "words"), MISTAKES, ids=[key for _, key, _ in MISTAKES])
+def test_mistakes_name_the_robot(tmp_path, text, key, words):
     with pytest.raises(vp.SceneFileError) as caught:
         vp.load_scene(write(tmp_path, text))
     assert caught.value.key == key

@@ -94,13 +94,21 @@ def test_read_and_written_again_it_is_the_same(name, tmp_path):
         np.testing.assert_array_equal(before[key], after[key])
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.99])
 @pytest.mark.parametrize("name", LOADERS)
-def test_truncated(name, share, tmp_path):
-    whole = (DATA / name).read_bytes()
-    path = tmp_path / name
-    path.write_bytes(whole[: int(share * len(whole))])
-    unread(name, path, "truncated")
+def test_what_is_no_such_record(name, tmp_path):
+    whole, path = (DATA / name).read_bytes(), tmp_path / name
+    for share in (0.0, 0.3, 0.9, 0.99):
+        path.write_bytes(whole[: int(share * len(whole))])
+        unread(name, path, "truncated")
+    others = [(DATA / other).read_bytes() for other in LOADERS if other != name]
+    for content in (b"hello", b"\x93NUMPY", bytes(1000), pickle.dumps({"q": 1}), *others):
+        path.write_bytes(content)
+        unread(name, path)
+    form = str(members_of(name)["format"])
+    unread(name, changed(tmp_path, name, format=form[:-1] + "9"), "/9")
+    os.mkfifo(tmp_path / "pipe.npz")
+    for missing in (tmp_path / "none.npz", tmp_path, tmp_path / "pipe.npz"):
+        unread(name, missing)
 
 
 @pytest.mark.parametrize("name", ["trajectory.npz"])
@@ -150,37 +158,6 @@ def test_numbers_that_are_not_finite(name, entry, value, tmp_path):
     array = members_of(name)[entry].copy()
     array[(-1,) * array.ndim] = value
     unread(name, changed(tmp_path, name, **{entry: array}), entry)
-
-
-@pytest.mark.parametrize("other", LOADERS)
-@pytest.mark.parametrize("name", LOADERS)
-def test_another_kind(name, other, tmp_path):
-    if LOADERS[name] != LOADERS[other]:
-        path = tmp_path / other
-        path.write_bytes((DATA / other).read_bytes())
-        unread(name, path)
-
-
-@pytest.mark.parametrize("name", LOADERS)
-def test_another_version(name, tmp_path):
-    form = str(members_of(name)["format"])
-    unread(name, changed(tmp_path, name, format=form[:-1] + "9"), "/9")
-
-
-@pytest.mark.parametrize("content", [b"", b"hello", b"\x93NUMPY", bytes(1000), pickle.dumps({"q": 1})])
-@pytest.mark.parametrize("name", LOADERS)
-def test_another_file(name, content, tmp_path):
-    path = tmp_path / name
-    path.write_bytes(content)
-    unread(name, path)
-
-
-@pytest.mark.parametrize("name", LOADERS)
-def test_no_file(name, tmp_path):
-    unread(name, tmp_path / "none.npz")
-    unread(name, tmp_path)
-    os.mkfifo(tmp_path / "pipe.npz")
-    unread(name, tmp_path / "pipe.npz")
 
 
 @pytest.mark.parametrize("name", LOADERS)

@@ -90,11 +90,7 @@ def add_integrator(parser: argparse.ArgumentParser) -> None:
 
 
 def integrator_of_words(text: str) -> Integrator:
-    """The integrator of a word of :func:`add_integrator`.
-
-    Raises:
-        InputError: The name is unknown, or the integrator does not have the option.
-    """
+    """The integrator of a word of :func:`add_integrator`."""
     name, bracket, rest = text.strip().partition("(")
     # runge_kutta_4 and RUNGEKUTTA4 are RungeKutta4.
     plain = {member.lower(): member for member in BY_NAME}
@@ -141,11 +137,7 @@ def _value(word: str) -> float | tuple[str, float] | str:
 
 
 def values_of(option: str, given: Sequence[float | tuple[str, float] | str] | None) -> JointValues | str | None:
-    """Value of an option of :func:`add_vector`: None if it was not given, one number, several, some by name, or a word.
-
-    Raises:
-        InputError: Names, numbers and words are mixed, or a name is given twice.
-    """
+    """Value of an option of :func:`add_vector`: None, one number, several, some by name, or a word."""
     if given is None:
         return None
     if len({type(item) for item in given}) > 1:

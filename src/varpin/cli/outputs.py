@@ -53,17 +53,7 @@ MarksOf = Callable[[float], Marks]
 
 
 def writers_of(request: argparse.Namespace, marks: MarksOf | None = None) -> Writers:
-    """Writers of the requested files, the most important first; what can fail before the run fails here.
-
-    Args:
-        request: The parsed command line.
-        marks: Function from the duration [s] of a motion to what its replay shows of the task.
-
-    Raises:
-        FileError: A file cannot be written.
-        InputError: Two files are the same, or a format or the speed is unknown.
-        MissingDependency: A package or program for videos is not installed.
-    """
+    """Writers of the requested files, the most important first; what can fail before the run fails here."""
     found: Writers = {}
     show = partial(_show, speed_of(request), request.trace, marks)
     for option, endings, write in (
@@ -95,7 +85,7 @@ def _plot(path: Path, robot: Robot, trajectory: Trajectory) -> None:
 
     figure, _ = plot_trajectory(trajectory, robot=robot)
     with atomic_file(path) as stream:
-        figure.savefig(stream, format=path.suffix[1:].lower(), dpi=150)  # type: ignore[union-attr]
+        figure.savefig(stream, format=path.suffix[1:].lower(), dpi=150)
 
 
 def _show(

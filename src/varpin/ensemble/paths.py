@@ -15,7 +15,6 @@ from varpin.core.arrays import Commands
 from varpin.ensemble.record import PathFailure
 from varpin.errors import VarpinError
 from varpin.integrators import Integrator, Segment
-from varpin.integrators.base import Failure
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
 from varpin.mechanics.wiener import Children
@@ -28,8 +27,6 @@ Extremes = dict[str, tuple[float, int]]
 
 # Paths in one call of the core.
 _GROUP = 32
-# Numbers in a block of nodes.
-_BLOCK = 1_000_000
 # A worker simulates one chunk of paths at a time. The size of a chunk depends on the ensemble alone, so that sums do
 # not depend on the number of workers: the number of chunks aimed at, then bounds of a chunk in steps and in paths.
 _CHUNKS, _LEAST_STEPS, _MOST_STEPS, _FEWEST_PATHS, _MOST_PATHS = 64, 4_000, 200_000, 16, 1024
@@ -184,99 +181,71 @@ def simulate_paths(task: Task) -> Part:
 
 
 class _Chunk:
-    """Paths in groups. A group has one integrator state; all groups advance by one block of nodes at a time."""
+    """Paths in groups, each of which is one call of the core."""
 
     def __init__(self, task: Task) -> None:
-        self.task, shared = task, task.shared
-        self.shared, self.paths = shared, len(task.q0)
+        self.task, self.shared = task, task.shared
+        shared, P = task.shared, len(task.q0)
         n, m, N = shared.scene.robot.dof, shared.scene.controls, shared.steps
-        self.groups = [slice(a, min(a + _GROUP, self.paths)) for a in range(0, self.paths, _GROUP)]
-        self.generators = shared.seeds.generators(task.first, task.first + self.paths)
-        # The previous control of each path; NaN before the first unless the policy gives one.
-        self.before = [np.repeat(shared.commands.before, group.stop - group.start, axis=0) for group in self.groups]
         # Whether controls are linear between nodes; the stored ones of steps are then their means.
         self.linear = len(shared.commands.stage_times) > 0
-        self.alive = np.ones(self.paths, dtype=bool)
-        self.nodes = np.zeros(self.paths, dtype=np.int64)
-        self.split = np.zeros(self.paths, dtype=np.int64)
-        self.most_energy, self.fastest = np.full((2, self.paths), -np.inf)
+        self.nodes, self.split = np.zeros((2, P), dtype=np.int64)
         self.failures: list[PathFailure] = []
-        block = max(1, _BLOCK // (self.paths * (2 * n + 1)) // shared.commands.hold) * shared.commands.hold
-        self.length = min(N, block)
-        # Nodes of a block; the paths are the last axis, over which statistics run.
-        self.block = np.empty((max(1, self.length), 2 * n + 1, self.paths))
-        self.moments = None
-        if task.moments:
-            self.moments = Moments(
-                np.zeros(N + 1, np.int64),
-                np.zeros((N + 1, 2 * n + 1)),
-                np.zeros((N + 1, 2 * n, 2 * n)),
-                np.zeros(N + 1),
-            )
-        self.values = np.empty((N + 1, 2 * n, self.paths)) if task.values else None
+        # States and energy; the paths are the last axis, over which statistics run.
+        self.x = np.full((N + 1, 2 * n + 1, P), np.nan)
         self.stored: dict[str, Floats] = {}
         if task.store:
-            self.stored = {name: np.full((self.paths, N + 1, n), np.nan) for name in ("q", "v", "p")}
-            self.stored |= {"energy": np.full((self.paths, N + 1), np.nan), "u": np.full((self.paths, N, m), np.nan)}
+            self.stored = {name: np.full((P, N + 1, n), np.nan) for name in ("q", "v", "p")}
+            self.stored |= {"energy": np.full((P, N + 1), np.nan), "u": np.full((P, N, m), np.nan)}
             if self.linear:
-                self.stored["u_nodes"] = np.full((self.paths, N + 1, m), np.nan)
+                self.stored["u_nodes"] = np.full((P, N + 1, m), np.nan)
                 self.stored["u_nodes"][:, 0] = shared.commands.before
 
     def part(self) -> Part:
-        """Simulate all steps."""
-        task, shared = self.task, self.shared
-        states = []
-        for group, before in zip(self.groups, self.before, strict=True):
-            state, first = shared.integrator.start(shared.scene, task.q0[group], task.v0[group])
-            states.append(state)
-            self._store(0, group, first, [1] * len(first), before)
-        self._reduce(0, np.ones(self.paths, dtype=np.int64))
-        for begin in range(0, shared.steps, max(1, self.length)):
-            end = min(shared.steps, begin + self.length)
-            done = np.concatenate(
-                [self._run_group(number, states[number], begin, end) for number in range(len(self.groups))]
-            )
-            self._reduce(begin + 1, done)
-        extremes = {
-            name: (float(values.max()), task.first + int(np.argmax(values)))
-            for name, values in (("split", self.split), ("energy", self.most_energy), ("speed", self.fastest))
-        }
+        """Simulate all paths."""
+        task, paths, n = self.task, len(self.task.q0), self.shared.scene.robot.dof
+        for first in range(0, paths, _GROUP):
+            self._simulate(slice(first, min(first + _GROUP, paths)))
+        energy = np.fmax.reduce(self.x[:, -1], axis=0, initial=-np.inf)
+        speed = np.fmax.reduce(np.abs(self.x[:, n:-1]), axis=(0, 1), initial=-np.inf)
         return Part(
             first=task.first,
-            paths=self.paths,
+            paths=paths,
             failures=tuple(self.failures),
-            extremes=extremes,
+            extremes={
+                name: (float(values.max()), task.first + int(np.argmax(values)))
+                for name, values in (("split", self.split), ("energy", energy), ("speed", speed))
+            },
             nodes=self.nodes,
-            moments=self.moments,
+            moments=self._moments() if task.moments else None,
             stored=self.stored,
-            values=self.values,
+            values=self.x[:, :-1] if task.values else None,
         )
 
-    def _run_group(self, number: int, state: object, begin: int, end: int) -> Integers:
-        """Simulate steps begin .. end of a group; the number of steps of each path, 0 for one that has failed."""
-        shared, group = self.shared, self.groups[number]
-        hold = shared.commands.hold
-        decisions = rows(shared.commands, begin // hold, end // hold, self.before[number])
-        increments = np.empty((group.stop - group.start, end - begin, shared.increments))
-        for drawn, child in zip(increments, self.generators[group], strict=True):
+    def _simulate(self, group: slice) -> None:
+        """Simulate the paths of a group and store them."""
+        shared, task, size = self.shared, self.task, group.stop - group.start
+        state, start = shared.integrator.start(shared.scene, task.q0[group], task.v0[group])
+        # The control before the first of each path; NaN unless the policy gives one.
+        before = np.repeat(shared.commands.before, size, axis=0)
+        self._store(0, group, start, before)
+        if not shared.steps:
+            return
+        increments = np.empty((size, shared.steps, shared.increments))
+        generators = shared.seeds.generators(task.first + group.start, task.first + group.stop)
+        for drawn, child in zip(increments, generators, strict=True):
             child.standard_normal(out=drawn)
         increments *= np.sqrt(shared.dt)
+        decisions = rows(shared.commands, 0, shared.steps // shared.commands.hold, before)
         try:
             segments = shared.integrator.rollout(shared.scene, state, decisions, increments, shared.dt)
         except CustomForceError as error:
             raise self._located(group, error) from error
-        alive = self.alive[group]
-        done = [len(segment.q) * int(still) for segment, still in zip(segments, alive, strict=True)]
-        self._store(begin + 1, group, segments, done, self.before[number])
-        lost = np.full(shared.scene.controls, np.nan)
-        self.before[number] = np.array([segment.u[-1] if len(segment.u) else lost for segment in segments])
-        for i, (k, segment) in enumerate(zip(done, segments, strict=True)):
-            if not alive[i]:
-                continue
-            self.split[group.start + i] += int(segment.statistics.substeps.sum()) - k
+        self._store(1, group, segments, before)
+        for path, segment in enumerate(segments, group.start):
+            self.split[path] = int(segment.statistics.substeps.sum()) - len(segment.q)
             if segment.failure is not None:
-                self._fail(group.start + i, begin + k, segment.failure)
-        return np.array(done, dtype=np.int64)
+                self.failures.append(PathFailure(task.first + path, len(segment.q), segment.failure.reason))
 
     def _located(self, group: slice, error: CustomForceError) -> VarpinError:
         """The error of a custom force, with the path and the step where it failed and the motion up to there."""
@@ -290,23 +259,18 @@ class _Chunk:
                 return found
         return error
 
-    def _fail(self, path: int, step: int, failure: Failure) -> None:
-        self.alive[path] = False
-        self.failures.append(PathFailure(self.task.first + path, step, failure.reason))
-
-    def _store(self, first: int, group: slice, segments: list[Segment], done: list[int], before: Floats) -> None:
-        """Store nodes of a group from node ``first`` on, ``done[i]`` of its i-th path after its control ``before``."""
+    def _store(self, first: int, group: slice, segments: list[Segment], before: Floats) -> None:
+        """Store nodes of a group from node ``first`` on; ``before`` are the controls before each path."""
         n, momentum = self.shared.scene.robot.dof, self.shared.integrator.variational
-        self.nodes[group] += done
-        for i, (segment, k) in enumerate(zip(segments, done, strict=True), group.start):
-            x = self.block[:, :, i]
-            x[:k, :n], x[:k, n:-1] = segment.q[:k], (segment.p if momentum else segment.v)[:k]
-            x[:k, -1] = segment.energy[:k]
-            if k < len(x):
-                x[k:] = np.nan
+        for i, segment in enumerate(segments, group.start):
+            k = len(segment.q)
+            self.nodes[i] += k
+            x = self.x[first : first + k, :, i]
+            x[:, :n], x[:, n:-1] = segment.q, segment.p if momentum else segment.v
+            x[:, -1] = segment.energy
             for name, array in self.stored.items():
                 if name in ("q", "v", "p", "energy"):
-                    array[i, first : first + k] = getattr(segment, name)[:k]
+                    array[i, first : first + k] = getattr(segment, name)
             if self.stored and first > 0:
                 # The control of the step to node k is in row k - 1.
                 mean, after = self._controls(segment, k, before[i - group.start : i - group.start + 1])
@@ -328,27 +292,19 @@ class _Chunk:
         return moved, moved
 
     @np.errstate(over="ignore", invalid="ignore")
-    def _reduce(self, first: int, done: Integers) -> None:
-        """Add the block to the statistics. It begins at node ``first`` and has ``done[i]`` nodes of path i."""
-        last, n2 = int(done.max()), self.block.shape[1] - 1
-        length = min(self.shared.steps + 1 - first, len(self.block))
-        block = self.block[:last]
-        np.fmax(self.most_energy, np.fmax.reduce(block[:, -1], axis=0, initial=-np.inf), out=self.most_energy)
-        speed = np.fmax.reduce(np.abs(block[:, n2 // 2 : -1]), axis=(0, 1), initial=-np.inf)
-        np.fmax(self.fastest, speed, out=self.fastest)
-        if self.values is not None:
-            self.values[first : first + length] = self.block[:length, :-1]
-        if self.moments is None:
-            return
+    def _moments(self) -> Moments:
+        """Sums over the paths at each node."""
+        nodes, size = len(self.x), self.x.shape[1] - 1
+        count, squares = np.zeros(nodes, np.int64), np.zeros((nodes, size, size))
+        mean, energy = np.zeros((nodes, size + 1)), np.zeros(nodes)
         begin = 0
         # Between two nodes at which paths fail, the set of paths is the same.
-        for end in np.unique(done[done > 0]).tolist():
-            inside = done >= end
-            span = block[begin:end] if inside.all() else np.compress(inside, block[begin:end], axis=2)
-            nodes = slice(first + begin, first + end)
-            moments, mean = self.moments, span.mean(axis=2)
-            deviation = span - mean[:, :, None]
-            moments.mean[nodes], moments.count[nodes] = mean, span.shape[2]
-            moments.squares[nodes] = np.einsum("jaP,jbP->jab", deviation[:, :-1], deviation[:, :-1])
-            moments.energy[nodes] = np.einsum("jP,jP->j", deviation[:, -1], deviation[:, -1])
+        for end in np.unique(self.nodes).tolist():
+            here, inside = slice(begin, end), self.nodes >= end
+            span = self.x[here] if inside.all() else np.compress(inside, self.x[here], axis=2)
+            count[here], mean[here] = span.shape[2], span.mean(axis=2)
+            deviation = span - mean[here, :, None]
+            squares[here] = np.einsum("jaP,jbP->jab", deviation[:, :-1], deviation[:, :-1])
+            energy[here] = np.einsum("jP,jP->j", deviation[:, -1], deviation[:, -1])
             begin = end
+        return Moments(count, mean, squares, energy)

@@ -47,34 +47,19 @@ class Axes:
 
 
 def save_npz(path: str | os.PathLike[str], form: str, record: Any) -> Path:
-    """Write a record of the format ``form`` as compressed npz; returns its path.
-
-    Raises:
-        FileError: The path cannot be written.
-    """
+    """Write a record of the format ``form`` as compressed npz; returns its path."""
     return write_npz(path, form, members_of(record))
 
 
 def write_npz(path: str | os.PathLike[str], form: str, members: Mapping[str, Any]) -> Path:
-    """Write arrays of the format ``form``; an existing file is replaced only when the new one is complete.
-
-    Raises:
-        FileError: The path cannot be written.
-    """
+    """Write arrays of the format ``form``; an existing file is replaced only when the new one is complete."""
     with atomic_file(path) as stream:
         np.savez_compressed(stream, **members, format=form)
     return Path(path)
 
 
 class Entry:
-    """An array of an npz file, of which the header alone has been read; ``np.asarray`` reads the rest.
-
-    Attributes:
-        source: The file.
-        name: The entry's name.
-        shape: Its shape.
-        dtype: Its type.
-    """
+    """An array of an npz file, of which the header alone has been read; ``np.asarray`` reads the rest."""
 
     def __init__(self, source: Path, archive: zipfile.ZipFile, name: str) -> None:
         self.source, self.name = source, name
@@ -106,9 +91,6 @@ def read_npz(source: Path, form: str | None = None) -> dict[str, Entry]:
     """The headers of the arrays of an npz file, which must be of the format ``form`` if that is given.
 
     Each array is read where it is asked for, so that a wrong shape is found before its data.
-
-    Raises:
-        FileError: The file is missing, not npz, truncated or damaged, has pickled objects, or is of another format.
     """
     with _opened(source) as archive:
         names = [name.removesuffix(".npy") for name in archive.namelist()]
@@ -121,11 +103,7 @@ def read_npz(source: Path, form: str | None = None) -> dict[str, Entry]:
 
 
 def read_format(source: Path) -> str:
-    """The format of an npz file; empty if it has none.
-
-    Raises:
-        FileError: As :func:`read_npz`.
-    """
+    """The format of an npz file; empty if it has none."""
     return str(np.asarray(read_npz(source).get("format", "")))
 
 
@@ -170,18 +148,9 @@ def members_of(record: Any, prefix: str = "") -> dict[str, Any]:
 def record_of(
     kind: type[T], members: Members, source: Path, *, prefix: str = "", sizes: Mapping[str, int] | None = None
 ) -> T:
-    """A record built from the entries of an npz file whose names begin with ``prefix``.
+    """A record built from the entries of an npz file whose names begin with ``prefix``; ``sizes`` are known axes.
 
-    Args:
-        kind: The dataclass of the record.
-        members: The arrays of the file.
-        source: The file, for errors.
-        prefix: Prefix of the entry names, empty or ending with a dot.
-        sizes: Known lengths of named axes; others are taken from the arrays.
-
-    Raises:
-        FileError: An entry is missing, or does not have the type, shape or values of its field. The message names the
-            file, the entry, and what is expected.
+    Raises a FileError that names the file, the entry, and what is expected.
     """
     builder = _Builder(source, dict(sizes or {}))
     record: T = builder.build(kind, builder.tables(kind, members, prefix), prefix.removesuffix("."))
@@ -189,12 +158,7 @@ def record_of(
 
 
 class _Builder:
-    """Records from the entries of a file.
-
-    Attributes:
-        source: The file, for errors.
-        sizes: Known lengths of named axes; extended by each array that is read.
-    """
+    """Records from the entries of a file."""
 
     def __init__(self, source: Path, sizes: dict[str, int]) -> None:
         self.source = source
@@ -343,9 +307,6 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """A binary stream whose contents replace ``path`` when the block ends without an error, and are deleted otherwise.
 
     What processes that were killed in such a block have left in the folder is deleted, too.
-
-    Raises:
-        FileError: The path cannot be written.
     """
     target = writable(path)
     host = socket.gethostname()

@@ -1,4 +1,4 @@
-"""Validators of user input. Each returns the checked value."""
+"""Validators of user input. Each returns the checked value, or raises an InputError that names the argument."""
 
 from __future__ import annotations
 
@@ -31,11 +31,7 @@ def require_memory(rows: int, columns: int, what: str, row: str) -> None:
 
 
 def finite_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    """``value`` as a new C-contiguous float array of exactly ``shape``.
-
-    Raises:
-        InputError: The entries are not numbers, the shape is another one (both are named), or an entry is not finite.
-    """
+    """``value`` as a new C-contiguous float array of exactly ``shape``."""
     array = as_floats(name, value)
     if array.shape != shape:
         raise InputError(f"{name} must have shape {shape}, got {array.shape}")
@@ -43,11 +39,7 @@ def finite_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
 
 
 def rotation_matrix(name: str, value: ArrayLike) -> Floats:
-    """``value`` as a new rotation matrix (3, 3).
-
-    Raises:
-        InputError: As :func:`finite_array`, or R'R is not 1 to 1e-6, or R mirrors.
-    """
+    """``value`` as a new rotation matrix (3, 3)."""
     R = finite_array(name, value, (3, 3))
     if np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
         raise InputError(f"{name} must be a rotation matrix: R'R = 1 and det R = 1")
@@ -76,11 +68,7 @@ def tuple_of(name: str, given: Any, kind: type, note: str = "") -> tuple[Any, ..
 
 
 def broadcast_array(name: str, value: object, size: int, *, limit: bool = False) -> Floats:
-    """``value``, one number or (size,), as a new float array (size,); a ``limit`` need not be finite.
-
-    Raises:
-        InputError: As for :func:`finite_array`.
-    """
+    """``value``, one number or (size,), as a new float array (size,); a ``limit`` need not be finite."""
     array = as_floats(name, value)
     if array.shape not in ((), (size,)):
         raise InputError(f"{name} must be one number or have shape ({size},), got {array.shape}")
@@ -100,20 +88,7 @@ def joint_array(
     absent: float = 0.0,
     lack: str = "the robot has no joint",
 ) -> Floats:
-    """``value`` as a new float array (n,) with a number for each of the n ``joints``.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: (n,), or numbers by joint name.
-        joints: The names, in order.
-        uniform: Whether one number may be given for all joints.
-        absent: The number of joints that are not named. An infinite one stands for no limit, and may be given.
-        lack: What the message says of an unknown name.
-
-    Raises:
-        UnknownJoint: There is no joint of that name.
-        InputError: As for :func:`finite_array`.
-    """
+    """``value`` as a new float array (n,) with a number for each of the ``joints``; 0 for those not named."""
     if isinstance(value, str) and name in _POSITIONS:
         raise InputError(
             f"{name} must be real numbers, ({len(joints)},) or by joint name, got {value!r}; the positions of a "
@@ -135,18 +110,7 @@ def joint_array(
 def control_array(
     name: str, value: Mapping[str, float], joints: Sequence[str] | None, *, absent: float = 0.0
 ) -> Floats:
-    """``value``, by the names of the driven joints, as a new float array (m,) with a number for each control.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: Numbers by joint name.
-        joints: The joint of each control; None where a control is not the force of one joint.
-        absent: As in :func:`joint_array`.
-
-    Raises:
-        UnknownJoint: There is no driven joint of that name.
-        InputError: Controls have no names, or a number is not finite.
-    """
+    """``value``, by the names of the driven joints, as a new float array (m,); ``absent`` for those not named."""
     if joints is None:
         raise InputError(
             f"{name} is given by joint name, but not every control is the force of one joint under this actuation: "
@@ -168,11 +132,7 @@ def control_values(
 
 
 def checked_limits(name: str, limits: tuple[ArrayLike, ArrayLike] | None, size: int) -> Floats:
-    """(lower, upper), each one number or (size,), as an array (2, size); infinite where there is no limit.
-
-    Raises:
-        InputError: ``limits`` is not a pair, a shape is wrong, a limit is NaN, or a lower one is above the upper one.
-    """
+    """(lower, upper), each one number or (size,), as an array (2, size); infinite where there is no limit."""
     pair = (-np.inf, np.inf) if limits is None else limits
     if not isinstance(pair, tuple | list | np.ndarray) or len(pair) != 2:
         both_sides = f"; for +-{limits:g} write (-{limits:g}, {limits:g})" if isinstance(limits, int | float) else ""
@@ -222,11 +182,7 @@ def some_limits(
 
 
 def over_time(name: str, function: Callable[[float], ArrayLike], times: Floats, size: int) -> Floats:
-    """Values (N, size) of a function of time at times (N,) [s].
-
-    Raises:
-        InputError: The function raises, or returns another shape or values that are not finite.
-    """
+    """Values (N, size) of a function of time at times (N,) [s]."""
     rows = [returned(name, partial(function, t), (size,), f" at t = {t:.6g} s") for t in times.tolist()]
     return np.array(rows).reshape(len(times), size)
 
@@ -234,11 +190,7 @@ def over_time(name: str, function: Callable[[float], ArrayLike], times: Floats, 
 def returned(
     name: str, call: Callable[[], object], shape: tuple[int, ...], at: str = "", error: type[InputError] = InputError
 ) -> Floats:
-    """What a user's function returns, an array of ``shape``; messages end with ``at``.
-
-    Raises:
-        InputError: It raises, or returns anything else; of the type ``error``.
-    """
+    """What a user's function returns, an array of ``shape``; messages end with ``at``."""
     try:
         value = call()
     except Exception as cause:
@@ -250,11 +202,7 @@ def returned(
 
 
 def as_floats(name: str, value: object) -> Floats:
-    """``value`` as a new float array.
-
-    Raises:
-        InputError: It is no array of real numbers; the message has its ``name``.
-    """
+    """``value`` as a new float array."""
     try:
         array = np.asarray(value)
         # True is no number: of damping=True nobody means 1.
@@ -268,11 +216,7 @@ def as_floats(name: str, value: object) -> Floats:
 
 
 def require_finite(name: str, array: Floats) -> Floats:
-    """``array`` itself if all of it is finite.
-
-    Raises:
-        InputError: An entry is not finite; the message names the first one.
-    """
+    """``array`` itself if all of it is finite."""
     # A sum of squares is the faster look, and may overflow.
     if not math.isfinite(np.vdot(array, array)) and not np.isfinite(array).all():
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
@@ -282,11 +226,7 @@ def require_finite(name: str, array: Floats) -> Floats:
 
 
 def positive(name: str, value: Any, unit: str) -> float:
-    """``value`` as a float > 0 and finite.
-
-    Raises:
-        InputError: It is not; the message names the value and its unit.
-    """
+    """``value`` as a float > 0 and finite."""
     number = real(name, value)
     if not (math.isfinite(number) and number > 0.0):
         raise InputError(f"{name} must be positive and finite [{unit}], got {value}")
@@ -334,11 +274,7 @@ def word(name: str, value: object, words: tuple[str, ...]) -> None:
 
 
 def count(name: str, value: Any, least: int = 0) -> int:
-    """``value`` as an int >= ``least``.
-
-    Raises:
-        InputError: It is not an integer, or too small.
-    """
+    """``value`` as an int >= ``least``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise InputError(f"{name} must be an integer, got {value!r}")
     if value < least:
@@ -347,34 +283,21 @@ def count(name: str, value: Any, least: int = 0) -> int:
 
 
 def flag(name: str, value: Any) -> bool:
-    """``value`` as a bool.
-
-    Raises:
-        InputError: It is neither True nor False; a text such as "no" would count as True.
-    """
+    """``value`` as a bool; a text such as "no" would count as True."""
     if not isinstance(value, bool | np.bool_):
         raise InputError(f"{name} must be True or False, got {value!r}")
     return bool(value)
 
 
 def path_like(name: str, path: Any) -> Path:
-    """``path`` as a Path, with ~ expanded.
-
-    Raises:
-        InputError: It is not a path.
-    """
+    """``path`` as a Path, with ~ expanded."""
     if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
         raise InputError(f"{name} must be a path, got {path!r}")
     return Path(path).expanduser()
 
 
 def writable(path: str | os.PathLike[str]) -> Path:
-    """``path`` with links resolved, checked before any work is done for the file.
-
-    Raises:
-        FileError: No file can be written there; the message gives the reason.
-        InputError: It is not a path.
-    """
+    """``path`` with links resolved, checked before any work is done for the file."""
     target = path_like("path", path).resolve()
     try:
         target.lstat()
@@ -415,17 +338,7 @@ def takes(function: Callable[..., object], arguments: int) -> bool:
 
 
 def told_motion(name: str, function: object, arguments: str, motion: str = "") -> bool:
-    """Whether a progress function takes the motion, too, as one argument more.
-
-    Args:
-        name: Name of the option, for the error.
-        function: The function, or None.
-        arguments: Its first arguments in words, separated by commas.
-        motion: The last argument in words; empty if there is none.
-
-    Raises:
-        InputError: The function can be called with neither number of arguments.
-    """
+    """Whether a progress function of ``arguments`` takes the ``motion``, too, as one argument more."""
     # A function of any number of arguments, such as print, gets the fewer ones.
     least = arguments.count(",") + 1
     if function is None or (callable(function) and takes(function, least)):

@@ -24,11 +24,7 @@ _AHEAD, _BYTES_AHEAD = 256, 2**31
 
 @contextlib.contextmanager
 def executing(executor: Executor | None, workers: int | None) -> Iterator[Executor]:
-    """The user's executor, which stays open, or ``workers`` threads; as many as there are cores if both are None.
-
-    Raises:
-        InputError: Both are given, or one is invalid.
-    """
+    """The user's executor, which stays open, or ``workers`` threads; as many as there are cores if both are None."""
     if executor is None:
         threads = count("workers", (os.cpu_count() or 1) if workers is None else workers, least=1)
         with ThreadPoolExecutor(threads) as pool:
@@ -56,17 +52,6 @@ def in_order(
 
     The tasks ahead of the awaited result are at most 256, with at most 2 GiB of results, but at least two. Close the
     iterator to cancel tasks that have not begun.
-
-    Args:
-        executor: The executor.
-        function: Function of a task.
-        tasks: The tasks, which are consumed one by one.
-        result_bytes: Size of a result [bytes].
-
-    Raises:
-        WorkersLost: The executor has lost its workers.
-        InputError: The tasks cannot be pickled for other processes.
-        Exception: ``function`` raised it.
     """
     ahead = max(2, min(_AHEAD, _BYTES_AHEAD // max(1, result_bytes)))
     left, waiting = iter(tasks), deque[Future[Result]]()

@@ -20,13 +20,7 @@ _POINTS = 400
 
 
 def marks_of(task: Task, duration: float, constraints: Scene | OptimalControlProblem) -> Marks:
-    """Marks from the cost: traces, targets, references and a ghost.
-
-    Args:
-        task: The scene.
-        duration: Duration of the motion [s].
-        constraints: What draws its constraints.
-    """
+    """Marks from the cost: traces, targets, references and a ghost."""
     wanted = [term for term in task.terms if term.target is not None and term.weight.all()]
     positions = [term for term in wanted if term.kind == "frame_position"]
     orientations = [term for term in wanted if term.kind == "frame_orientation"]

@@ -189,12 +189,7 @@ def _suggestion(word: str, names: Iterable[str], what: str) -> str:
 
 
 def find_scene(source: str | Path, bundled: Mapping[str, Path]) -> Path:
-    """The scene file at a path, or the bundled one of that name.
-
-    Raises:
-        FileError: There is no such file; similar names are listed.
-        InputError: ``source`` is not a path.
-    """
+    """The scene file at a path, or the bundled one of that name."""
     if not isinstance(source, str | Path) or "\0" in str(source):
         raise InputError(f"a scene must be the path of a TOML file or a name, got {type(source).__name__}")
     path = bundled.get(str(source), Path(source).expanduser())
@@ -204,12 +199,7 @@ def find_scene(source: str | Path, bundled: Mapping[str, Path]) -> Path:
 
 
 def toml_of(path: Path) -> dict[str, Any]:
-    """The content of a TOML file.
-
-    Raises:
-        FileError: The file cannot be read.
-        SceneFileError: It is no TOML.
-    """
+    """The content of a TOML file."""
     try:
         return tomllib.loads(path.read_bytes().decode("utf-8").replace("\r\n", "\n"))
     except OSError as error:

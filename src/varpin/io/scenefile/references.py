@@ -25,12 +25,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
-    """Values over time, one column for each component.
-
-    Attributes:
-        at: Function from times (N,) [s] to values (N, c).
-        constant: Whether the values are the same at all times.
-    """
+    """Values over time, one column for each component."""
 
     at: Callable[[Floats], Floats]
     constant: bool = False

@@ -283,11 +283,7 @@ def _touched(term: Term, task: Task) -> Mask:
 
 
 def task_of(root: Where, tables: dict[str, Any]) -> Task:
-    """Load the robot of a file and apply the file to it.
-
-    Raises:
-        SceneFileError: There is a mistake in it, or names, lengths or values do not fit the robot.
-    """
+    """Load the robot of a file and apply the file to it."""
     root.table(tables, TABLES, ("robot", "horizon"))
     at = root.at("horizon")
     keys = ("dt", "steps", "duration", "hold", "sampling", "controls", "between_nodes")
