@@ -220,9 +220,10 @@ def test_velocity_dependent_noise_converges_to_the_stratonovich_limit(kick):
     assert spreads[1] < 0.65 * spreads[0]
 
 
-def test_a_split_kick_takes_half_of_its_correction():
-    """Of 1/2 over a second: the whole or none of it moves log v as much."""
-    logs, w = geometric_logs("split", derivative_of_geometric_noise, 50, paths=10)
+@BOTH
+def test_a_kick_has_the_correction_of_its_parts(kick):
+    """Of 1/2 over a second, a half of it for a split one: more or less of it moves log v as much."""
+    logs, w = geometric_logs(kick, derivative_of_geometric_noise, 50, paths=10)
     assert abs((logs - RATE * w).mean()) < 0.2
 
 
