@@ -30,7 +30,6 @@ MARKS = {
     "runaway": "away",
     "legend": "how to read it",
     "right derivatives": "the derivatives are those of the step",
-    "wrong derivatives": "is not the derivative of the step",
     "another difference": "another step=",
     "left out of the description": "the scene leaves out",
     "out of reach": "not within reach",

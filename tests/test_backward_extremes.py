@@ -74,21 +74,18 @@ def passes(A, B, gradient, hessian, end_gradient, end_hessian, h):
     """(failed, gains, feed-forward, loss) of the compiled recursion and of the one on square roots."""
     N, x, m = B.shape
     nothing = np.zeros((N, x, 0))
-    steps = core.ExpandedSteps(
-        A=A, B=B, G=nothing, Gx=np.zeros((N, x, 0, x)), Gu=np.zeros((N, x, 0, m)),
-        gradient=gradient, hessian=hessian,
-    )  # fmt: skip
+    given = {"A": A, "B": B, "G": nothing, "Gx": np.zeros((N, x, 0, x)), "Gu": np.zeros((N, x, 0, m))}
+    given |= {"gradient": gradient, "hessian": hessian}
     for roots in (False, True):
         feedforward, feedback = np.zeros((N, m)), np.zeros((N, m, x))
-        gains = core.Gains(
-            feedforward=feedforward, feedback=feedback, control_gradient=np.zeros((N, m)), spread=np.zeros((0, x, x)),
-        )  # fmt: skip
+        gains = {"feedforward": feedforward, "feedback": feedback, "control_gradient": np.zeros((N, m))}
+        gains |= {"spread": np.zeros((0, x, x)), "factors": np.zeros((N, m, m))}
         if roots:
             run = core.RootPass(m, squares_of(end_gradient[None], end_hessian[None]).core, end_gradient)
-            failed = run.run(h, 1, 0.0, steps, gains, squares_of(gradient, hessian).core)
+            failed = run.run(h, 1, 0.0, **given, **gains, running=squares_of(gradient, hessian).core)
         else:
             run = core.BackwardPass(m, end_gradient, end_hessian)
-            failed = run.run(h, 1, 0.0, steps, gains)
+            failed = run.run(h, 1, 0.0, **given, **gains)
         yield failed, feedback, feedforward, run.loss
 
 

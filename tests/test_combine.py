@@ -1,14 +1,11 @@
 """Several robots as one tree, against the robots by themselves and Pinocchio."""
 
-import pickle
-
 import numpy as np
 import pinocchio as pin
 import pytest
 from refusals import refused
 
 import varpin as vp
-from varpin.mechanics.assembly import along_constraints
 from varpin.model import geometry, readable_geometry
 
 PLACE = pin.SE3(pin.utils.rotate("z", np.pi) @ pin.utils.rotate("x", 0.2), np.array([1.2, 0.1, 0.2]))
@@ -80,27 +77,6 @@ def test_names_that_clash_get_a_prefix(arms):
     assert len(geometry(four).geometryObjects) == 4 * 7 + 11
     locked = vp.load_robot("ur5", lock={"wrist_3_joint": 0.3})
     assert vp.combine(locked, locked).locked == {"a_wrist_3_joint": 0.3, "b_wrist_3_joint": 0.3}
-
-
-def test_two_arms_hold_one_object():
-    """A weld between the hands: the loop stays closed, and as a rod of two forces it does no work."""
-    arm = vp.load_robot("ur5")
-    pair = vp.combine(arm, arm, placements=[None, PLACE], prefixes=["left_", "right_"])
-    apart = np.eye(4)
-    apart[:3, :3], apart[2, 3] = pin.utils.rotate("x", np.pi), 0.4
-    scene = vp.Scene(pair, constraints=vp.FrameOnFrame("left_tool0", "right_tool0", apart))
-    q = vp.assemble(scene, [0.2, -1.2, 1.5, -0.3, 1.4, 0.0] * 2)
-    v = along_constraints(scene, q, np.ones(12))
-    motion = vp.simulate(scene, q, v, dt=2e-3, steps=50, integrator=vp.Gauss(2))
-    left, right = (pair.frame_positions(motion.q, f"{side}_tool0") for side in ("left", "right"))
-    np.testing.assert_allclose(np.linalg.norm(left - right, axis=1), 0.4, atol=1e-12)
-    np.testing.assert_allclose(motion.energy, motion.energy[0], atol=1e-6 * np.abs(motion.energy).max())
-    assert len(set(scene.group.tolist())) == 1
-    again = pickle.loads(pickle.dumps(pair))
-    np.testing.assert_array_equal(vp.simulate(vp.Scene(again), q, v, dt=1e-3, steps=2).q.shape, (3, 12))
-    noisy = vp.Scene(pair, constraints=scene.constraints, noise=vp.AdditiveNoise(0.01))
-    paths = vp.simulate_ensemble(noisy, q, v, dt=2e-3, steps=3, paths=4, rng=0)
-    assert not paths.failures
 
 
 WRONG = {

@@ -10,8 +10,6 @@ from refusals import refused
 
 import varpin as vp
 from varpin.mechanics.assembly import along_constraints
-from varpin.study import precision
-from varpin.study.motion import Setting
 
 
 def four_bar(**options):
@@ -79,14 +77,6 @@ def test_a_custom_constraint_that_fails_under_a_tolerance_is_an_error_with_the_m
     assert 0.5 < caught.value.trajectory.q[-1, 0] < 0.61
 
 
-def test_the_reference_of_measurements_is_that_of_index_reduced_equations():
-    loop, q, v, truth = exact(13)
-    setting = Setting.of(loop.scene, q, v, None, loop.duration)
-    own, other = precision._constrained(setting, 16)
-    assert np.abs(own - other).max() < 1e-11
-    np.testing.assert_allclose(own, truth, atol=1e-10)
-
-
 def test_work_and_precision_under_constraints():
     scene, q, v = four_bar(damping=0.1)
     record = vp.work_precision(scene, q, v, duration=0.4, dts=[0.01, 0.005], repeats=1)
@@ -117,13 +107,6 @@ def test_advice_says_in_the_log_that_the_start_was_moved(caplog):
     scene, q, v = four_bar()
     vp.advise(scene, q + 1e-3, v, duration=0.1, tolerance=1e-3)
     assert about(caplog.messages, "start off the constraints")
-
-
-def test_energy_errors_are_those_of_loops_without_a_hand():
-    scene, q, v = four_bar()
-    assert Setting.of(scene, q, v, None, 0.1).conservative
-    moved = vp.Scene(vp.planar_chain(2), actuation=["joint1"], constraints=vp.KinematicInput("joint1"))
-    assert not Setting.of(moved, np.zeros(2), np.zeros(2), None, 0.1).conservative
 
 
 def test_plans_of_a_loop_by_different_integrators():

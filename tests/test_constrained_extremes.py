@@ -10,25 +10,6 @@ import varpin as vp
 from varpin.mechanics.assembly import along_constraints
 
 
-def four_bar(**options):
-    scene = vp.Scene(vp.planar_chain(3), constraints=vp.PointOnPoint("tip", (1.3, 0.0, 0.2), axes="xz"), **options)
-    q = vp.assemble(scene, [-1.5, 1.5, 1.5])
-    return scene, q, along_constraints(scene, q, np.array([1.0, 0.0, 0.0]))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("integrator", "amplitude"), [(vp.Midpoint(), 1.0), (vp.Gauss(2), 1e-2)])
-def test_energy_has_no_trend_over_a_thousand_seconds(integrator, amplitude):
-    scene, q, v = four_bar()
-    # In whole steps: where some are split, energy walks at random.
-    motion = vp.simulate(scene, q, v, dt=5e-3, steps=200_000, integrator=integrator, check=False)
-    assert motion.statistics.split_steps == 0
-    error = motion.energy - motion.energy[0]
-    slope = np.polyfit(motion.t, error, 1)[0]
-    assert np.abs(error).max() < amplitude
-    assert abs(slope) * 1000.0 < 0.1 * np.ptp(error)
-
-
 def odd_loops(count):
     """Loops that are nearly flat, closed twice, welded, geared or started off their constraints."""
     rng = np.random.default_rng(5)

@@ -7,15 +7,13 @@ import gc
 import numpy as np
 import pinocchio as pin
 import pytest
-from mechanisms import joint, link, mimic, random_tree, write_urdf
 from refusals import refused
-from test_linearization import difference
+from test_border import of_mechanism
 
 import varpin as vp
 from varpin.core import (
     ExplicitMethod,
     ExplicitRollout,
-    Links,
     Mechanism,
     Outcome,
     Rollout,
@@ -58,17 +56,6 @@ def test_the_jet_along_a_direction_is_its_difference(scene):
         assert np.abs(ours - theirs).max() <= 1e-9 * np.abs(theirs).max()
 
 
-def test_arrays_of_a_wrong_shape_are_refused(scene):
-    n = scene.robot.dof
-    q = np.zeros(n)
-    with refused(ValueError, "v", str(n + 1), str(n)):
-        scene.core.jet(q, np.zeros(n + 1))
-    with refused(ValueError, "v", "2", "0", "3"):
-        scene.core.jets(np.zeros((3, n)), np.zeros((2, n)))
-    with pytest.raises(TypeError):
-        scene.core.jet(q, np.zeros((n, n)))
-
-
 @pytest.mark.parametrize("integrator", [vp.Gauss(2), vp.Midpoint(), vp.RungeKutta4()], ids=repr)
 @pytest.mark.parametrize("line", [False, True])
 def test_paths_with_controls_of_their_own(integrator, line):
@@ -102,59 +89,10 @@ def test_paths_with_controls_of_their_own(integrator, line):
     ],
 )
 def test_what_is_no_tree_is_refused(field, value, facts):
-    tree = vp.planar_chain(2).tree
-    names = (
-        "parent", "prismatic", "rotation", "translation", "mass", "center", "inertia", "coordinate", "ratio",
-        "offset", "origin", "loads", "carried", "periodic", "armature", "group",
-    )  # fmt: skip
-    own = {name: getattr(tree, name) for name in names}
-    own["ends"] = np.array(tree.ends)
-    own[field] = np.array(value, dtype=own[field].dtype)
-    own |= {
-        "forces": (),
-        "couplings": (),
-        "constraints": ConstraintRows(),
-        "custom": None,
-        "actuation": np.eye(2),
-        "constant": np.zeros((2, 0)),
-        "control": np.zeros((2, 0, 2)),
-    }
-    own |= {"quadratic": np.zeros((2, 0)), "centers": np.zeros((2, 0))}
+    own = of_mechanism(vp.Scene(vp.planar_chain(2)))
+    own[field] = np.array(value, dtype=np.asarray(own[field]).dtype)
     with refused(ValueError, facts):
-        Mechanism.make(**own, groups=tree.groups, gravity=np.zeros(3))
-
-
-def mimicking(folder):
-    """Two branches, the first joint of one tied to that of the other."""
-    parts = [
-        joint("a1", "base", "a_1"),
-        joint("a2", "a_1", "a_2"),
-        joint("b1", "base", "b_1", inside=mimic("a1", -2.0)),
-    ]
-    return vp.load_robot(write_urdf(folder, *map(link, ("a_1", "a_2", "b_1")), *parts, name="mimicking"))
-
-
-@pytest.mark.parametrize("robot", [*range(6), "mimic"])
-def test_accelerations_with_their_derivatives(robot, tmp_path):
-    """On trees with branches, sliders and armature, against inverse dynamics and differences."""
-    own = mimicking(tmp_path) if robot == "mimic" else vp.load_robot(random_tree(robot, 6, armature=0.1))
-    n = own.dof
-    scene = vp.Scene(own, gravity=(1.0, -2.0, -9.0), damping=0.3, stiffness=2.0, rest=0.1)
-    q, v, force = rng.uniform(-1.0, 1.0, (3, 4, n))
-    a, *slopes, done = accelerations(scene.core, q, v, force)
-    assert done == 4
-    for k in range(4):
-        # d/dt L_v = L_q + forces, with d/dt L_v = L_vq v + M a.
-        _, Lq, _, _, Lvq, M = scene.core.jet(q[k], v[k])
-        assert np.abs(M @ a[k] + Lvq @ v[k] - Lq + 0.3 * v[k] - force[k]).max() < 1e-11 * np.abs(M @ a[k]).max() + 1e-11
-
-        def acceleration(x):
-            return accelerations(scene.core, *x.reshape(3, 1, n))[0][0]
-
-        x = np.concatenate([q[k], v[k], force[k]])
-        numeric = difference(acceleration, x, np.full(3 * n, 1e-2))
-        given = np.hstack([slope[k] for slope in slopes])
-        assert np.abs(given - numeric).max() < 1e-8 * np.abs(numeric).max()
+        Mechanism.make(**own)
 
 
 def sliding():
@@ -230,18 +168,12 @@ class TestRollouts:
         [
             (lambda nodes: {"nodes": nodes._replace(q=nodes.q[:, :, ::-1])}, TypeError, "q"),
             (lambda nodes: {"nodes": nodes._replace(done=nodes.done.astype(np.int32))}, TypeError, "done"),
-            (lambda nodes: {"nodes": nodes._replace(p=np.zeros((3, 4, 3)))}, ValueError, ("p", "3", "2")),
-            (lambda nodes: {"nodes": new_nodes(2, 4, 2, 2)}, ValueError, "paths"),
-            (lambda nodes: {"commands": open_loop(np.zeros((3, 2)))}, ValueError, "steps"),
-            (lambda nodes: {"commands": open_loop(np.zeros((4, 1)))}, ValueError, ("u", "1")),
             (lambda nodes: {"commands": open_loop(np.zeros((4, 2)))._replace(hold=0)}, ValueError, "steps"),
             (
                 lambda nodes: {"commands": open_loop(np.zeros((4, 2)))._replace(gains=np.zeros((4, 2, 3)))},
                 ValueError,
                 "column",
             ),
-            (lambda nodes: {"drift": np.zeros((3, 1, 2))}, ValueError, ("drift", "1")),
-            (lambda nodes: {"increments": np.zeros((3, 4, 1))}, ValueError, ("increments", "1", "2")),
         ],
     )
     def test_what_does_not_fit_is_refused(self, scene, change, error, facts):
@@ -250,22 +182,6 @@ class TestRollouts:
         self.roll(rollout, **given)
         with refused(error, facts):
             self.roll(rollout, **(given | change(given["nodes"])))
-
-
-@pytest.mark.parametrize(
-    ("change", "facts"),
-    [
-        ({"parent": np.array([-1, 1])}, "parents"),
-        ({"coordinate": np.array([0, 2])}, "coordinate"),
-        ({"ratio": np.ones(3)}, ("ratio", "3")),
-        ({"rotation": np.zeros((2, 3, 2))}, ("rotation", "2")),
-    ],
-)
-def test_what_are_no_links_is_refused(change, facts):
-    own = vp.planar_chain(2).tree
-    names = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio", "offset", "mass", "center")
-    with refused(ValueError, facts):
-        Links.make(**({name: getattr(own, name) for name in names} | change), dof=2)
 
 
 def test_matrices_beyond_the_range_of_indices_are_refused_before_there_is_room_for_them():

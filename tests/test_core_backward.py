@@ -13,7 +13,7 @@ H = 0.1  # the step
 
 
 def random_steps(dof, m, k, *, seed, steps=6):
-    """Arrays of :class:`varpin.core.ExpandedSteps` with nothing special about them, every Hessian positive definite."""
+    """Steps for a backward pass with nothing special about them, every Hessian positive definite."""
     rng = np.random.default_rng(seed)
     x, size = 2 * dof, 2 * dof + m
 
@@ -42,6 +42,12 @@ def gains_for(given, hold):
         "control_gradient": np.full((R, m), np.nan),
         "spread": np.full((N if k else 0, x, x), np.nan),
     }
+
+
+def run_over(run, given, gains, hold=1, regularization=0.0, **more):
+    """The result of a pass over steps that fills in the gains."""
+    R, m = gains["feedforward"].shape
+    return run.run(H, hold, regularization, **given, **{"factors": np.empty((R, m, m)), **gains}, **more)
 
 
 def plainly(given, hold, regularization, end_gradient, end_hessian):
@@ -102,16 +108,15 @@ def test_both_passes_are_the_equations(dof, m, hold, k, regularization):
     given = random_steps(dof, m, k, seed=dof)
     gradient, hessian = terminal(2 * dof)
     right, sums = plainly(given, hold, regularization, gradient, hessian)
-    steps = core.ExpandedSteps(**given)
     plain = core.BackwardPass(m, gradient, hessian)
     ours = gains_for(given, hold)
-    assert plain.run(H, hold, regularization, steps, core.Gains(**ours)) == -1
+    assert run_over(plain, given, ours, hold, regularization) == -1
     close(ours, right, 10)
     np.testing.assert_allclose((plain.slope, plain.curvature, plain.noise), sums, rtol=1e-10)
     roots = core.RootPass(m, squares_of(gradient[None], hessian[None]).core, gradient)
     ours = gains_for(given, hold)
     running = squares_of(given["gradient"], given["hessian"]).core
-    assert roots.run(H, hold, regularization, steps, core.Gains(**ours), running) == -1
+    assert run_over(roots, given, ours, hold, regularization, running=running) == -1
     close(ours, right, 9)
     np.testing.assert_allclose((roots.slope, roots.curvature, roots.noise), sums, rtol=1e-9)
 
@@ -128,7 +133,7 @@ def test_blocks():
         views = {
             name: array[begin:end] if name == "spread" else array[begin // 2 : end // 2] for name, array in ours.items()
         }
-        assert run.run(H, 2, 0.0, core.ExpandedSteps(**part), core.Gains(**views)) == -1
+        assert run_over(run, part, views, 2) == -1
     close(ours, right, 10)
     np.testing.assert_allclose((run.slope, run.curvature, run.noise), sums, rtol=1e-10)
 
@@ -165,9 +170,7 @@ def test_the_decision_without_a_minimum_is_told():
     given = random_steps(2, 2, 0, seed=2)
     given["hessian"][3, 4:, 4:] = -1e6 * np.eye(2)
     gradient, hessian = terminal(4)
-    assert core.BackwardPass(2, gradient, hessian).run(
-        H, 1, 0.0, core.ExpandedSteps(**given), core.Gains(**gains_for(given, 1))
-    ) == 3  # fmt: skip
+    assert run_over(core.BackwardPass(2, gradient, hessian), given, gains_for(given, 1)) == 3
 
 
 @pytest.mark.parametrize(
@@ -178,32 +181,32 @@ def test_the_decision_without_a_minimum_is_told():
         ("Gx", (6, 4, 1, 3), ("Gx", "3", "4")),
         ("gradient", (5, 6), ("gradient", "5", "0", "6")),
         ("hessian", (5, 6, 6), ("hessian", "5", "0", "6")),
-    ],
-)
-def test_steps_that_do_not_fit_are_refused(name, shape, facts):
-    given = random_steps(2, 2, 1, seed=3) | {name: np.zeros(shape)}
-    with refused(ValueError, facts):
-        core.ExpandedSteps(**given)
-
-
-def test_gains_that_do_not_fit_are_refused():
-    """Before anything is written; what is written to is never a copy."""
-    given = random_steps(2, 2, 1, seed=3)
-    steps, (gradient, hessian) = core.ExpandedSteps(**given), terminal(4)
-    for name, shape, facts in (
         ("feedback", (6, 2, 3), ("feedback", "3", "2", "4")),
         ("spread", (0, 4, 4), ("spread", "0", "6")),
-    ):
-        gains = core.Gains(**gains_for(given, 1) | {name: np.zeros(shape)})
-        with refused(ValueError, facts):
-            core.BackwardPass(2, gradient, hessian).run(H, 1, 0.0, steps, gains)
+        ("factors", (6, 2, 1), ("factors", "1", "2")),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(name, shape, facts):
+    given = random_steps(2, 2, 1, seed=3)
+    gains = gains_for(given, 1)
+    (given if name in given else gains)[name] = np.zeros(shape)
+    with refused(ValueError, facts):
+        run_over(core.BackwardPass(2, *terminal(4)), given, gains)
+
+
+def test_what_is_written_to_is_never_a_copy():
+    given = random_steps(2, 2, 1, seed=3)
     for strided in (np.zeros((6, 4))[:, ::2], np.zeros((6, 2), dtype=np.float32)):
         with pytest.raises(TypeError):
-            core.Gains(**gains_for(given, 1) | {"feedforward": strided})
-    gains = core.Gains(**gains_for(given, 1))
+            run_over(core.BackwardPass(2, *terminal(4)), given, gains_for(given, 1) | {"feedforward": strided})
+
+
+def test_passes_that_do_not_fit_are_refused():
+    given = random_steps(2, 2, 1, seed=3)
+    gains, (gradient, hessian) = gains_for(given, 1), terminal(4)
     with refused(ValueError, "hold"):
-        core.BackwardPass(2, gradient, hessian).run(H, 4, 0.0, steps, gains)
+        run_over(core.BackwardPass(2, gradient, hessian), given, gains, 4)
     with refused(ValueError, "states"):
-        core.BackwardPass(1, gradient, hessian).run(H, 1, 0.0, steps, gains)
+        run_over(core.BackwardPass(1, gradient, hessian), given, gains)
     with refused(ValueError, "hessian", "3", "0", "4"):
         core.BackwardPass(2, gradient, hessian[:3])

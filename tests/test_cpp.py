@@ -134,24 +134,12 @@ def planned():
         hessian = np.diag([0.0] * (2 * n) + [effort] * m)
         last = np.concatenate([at_goal * (motion.q[-1] - goal), at_rest * motion.p[-1]])
         lin = vp.linearize(scene, motion)
-        steps = core.ExpandedSteps(
-            A=np.ascontiguousarray(lin.A),
-            B=np.ascontiguousarray(lin.B),
-            G=np.zeros((N, 2 * n, 0)),
-            Gx=np.zeros((N, 2 * n, 0, 2 * n)),
-            Gu=np.zeros((N, 2 * n, 0, m)),
-            gradient=gradient,
-            hessian=hessian[None],
-        )
-        k, K = np.empty((N, m)), np.empty((N, m, 2 * n))
-        gains = core.Gains(
-            feedforward=k,
-            feedback=K,
-            control_gradient=np.empty((N, m)),
-            spread=np.zeros((0, 2 * n, 2 * n)),
-        )
-        hessian = np.diag([at_goal] * n + [at_rest] * n)
-        assert core.BackwardPass(m, last, hessian).run(h, 1, 0.0, steps, gains) < 0
+        k, K, nothing = np.empty((N, m)), np.empty((N, m, 2 * n)), np.zeros((N, 2 * n, 0))
+        found = {"feedforward": k, "feedback": K, "control_gradient": np.empty((N, m)), "factors": np.empty((N, m, m))}
+        given = {"G": nothing, "Gx": nothing[..., None] * last, "Gu": nothing[..., None] * u0, "hessian": hessian[None]}
+        run = core.BackwardPass(m, last, np.diag([at_goal] * n + [at_rest] * n))
+        arrays = {**given, **found, "spread": np.zeros((0, 2 * n, 2 * n)), "gradient": gradient}
+        assert run.run(h, 1, 0.0, A=lin.A, B=lin.B, **arrays) < 0
         return k, K
 
     def policy(u, K, motion):

@@ -106,14 +106,34 @@ def test_shown():
     assert "CustomForce" in repr(scene())
 
 
-def test_a_motion_is_linearized_with_its_own_functions():
+def test_a_motion_under_a_function_is_not_linearized_without_one():
     robot = vp.planar_chain(2)
     scene = vp.Scene(robot, forces=[vp.CustomForce(lambda q, v: -5.0 * v)])
-    motion = vp.simulate(scene, [0.3, 0.2], [0.0, 0.0], dt=1e-3, steps=50)
+    motion = vp.simulate(scene, [0.3, 0.2], [0.0, 0.0], dt=1e-3, steps=5)
     vp.linearize(scene, motion)
-    for other in (vp.Scene(robot), vp.Scene(robot, forces=[vp.CustomForce(lambda q, v: -4.0 * v)])):
-        with refused(vp.InputError, "scene"):
-            vp.linearize(other, motion)
+    with refused(vp.InputError, "scene"):
+        vp.linearize(vp.Scene(robot), motion)
+
+
+@pytest.mark.parametrize("most", [0.2, 0.3, 0.4, 0.5])
+def test_all_steps_before_a_function_that_raises_are_kept_under_linear_controls(most):
+    def drag(q, v):
+        if abs(v[0]) > most:
+            raise ValueError("beyond the table")
+        return -0.1 * v
+
+    scene = vp.Scene(vp.planar_chain(1), forces=[vp.CustomForce(drag)])
+    given = np.zeros((9, 1)), np.zeros((9, 1, 2)), np.zeros((9, 2))
+    policy = vp.LinearPolicy(*given, linear=True, before=[0.0])
+    with refused(vp.ForceError, "beyond the table") as caught:
+        vp.simulate(scene, [0.3], [0.0], dt=0.01, steps=9, controls=policy)
+    error = caught.value
+    held = [np.zeros((error.step + more, 1)) for more in (0, 1)]
+    assert (
+        vp.simulate(scene, [0.3], [0.0], dt=0.01, steps=error.step, controls=held[0], check=False).steps == error.step
+    )
+    with refused(vp.ForceError, "beyond the table"):
+        vp.simulate(scene, [0.3], [0.0], dt=0.01, steps=error.step + 1, controls=held[1], check=False)
 
 
 def test_a_function_that_raises_in_the_check_leaves_the_motion():
@@ -143,15 +163,6 @@ class TestDifferences:
             _, by_v = own.slopes(np.zeros(3), np.full(3, v))
             exact = -0.5 / 1e-4 / np.cosh(v / 1e-4) ** 2
             np.testing.assert_allclose(by_v, exact * np.eye(3), rtol=0, atol=1e-6 * max(1.0, abs(exact)))
-
-    def test_a_joint_that_narrow_friction_stops(self):
-        """As varpin's own friction has it, with Newton's method on derivatives by differences."""
-        own = vp.Scene(ROBOT, gravity=False, forces=vp.CustomForce(narrow))
-        other = vp.Scene(ROBOT, gravity=False, forces=vp.CoulombFriction(0.5, 1e-4))
-        one, two = (
-            vp.simulate(each, Q0, V0, dt=2e-3, steps=40, integrator=vp.Radau(2), check=False) for each in (own, other)
-        )
-        np.testing.assert_allclose(one.q, two.q, rtol=0, atol=1e-9)
 
 
 class TestDerivativesThatAreWrong:

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from mechanisms import slider
 from refusals import refused
-from scipy.optimize import root
 
 import varpin as vp
 from varpin.integrators.tableau import gauss_coefficients
@@ -25,49 +24,9 @@ def test_tableau(stages):
     np.testing.assert_allclose(weighted + weighted.T, np.outer(b, b), rtol=0, atol=1e-16)
 
 
-@pytest.mark.parametrize("stages", [1, 2, 3, 5])
-def test_one_step_solves_the_stage_equations(stages):
-    """Against a plain solver: unknown positions of the stages, Pinocchio's derivatives, SciPy's root finder."""
-    scene = vp.Scene(vp.load_robot("ur5"), damping=0.7, stiffness=3.0, rest=0.2)
-    q0, v0, u = np.random.default_rng(3).normal(size=(3, 6))
-    dt = 2e-2
-    nodes, weights = np.polynomial.legendre.leggauss(stages)
-    c, b = 0.5 + 0.5 * nodes, 0.5 * weights
-    powers = np.vander(c, increasing=True)
-    a = (c[:, None] * powers / np.arange(1, stages + 1)) @ np.linalg.inv(powers)
-    p0 = vp.lagrangian_jet(scene, q0, v0, backend="pinocchio").Lv
-
-    def at(x):
-        Q = x.reshape(stages, 6)
-        V = np.linalg.solve(a, Q - q0) / dt
-        jets = [vp.lagrangian_jet(scene, *pair, backend="pinocchio") for pair in zip(Q, V, strict=True)]
-        slope = np.array([jet.Lq for jet in jets]) + u - scene.damping * V
-        return V, np.array([jet.Lv for jet in jets]), slope
-
-    def equations(x):
-        _, momenta, slope = at(x)
-        return (p0 + dt * a @ slope - momenta).ravel()
-
-    solution = root(equations, (q0 + dt * c[:, None] * v0).ravel(), tol=1e-13)
-    V, _, slope = at(solution.x)
-    end = vp.simulate(scene, q0, v0, dt=dt, steps=1, controls=u, integrator=vp.Gauss(stages), check=False)
-    np.testing.assert_allclose(end.q[1], q0 + dt * b @ V, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(end.p[1], p0 + dt * b @ slope, rtol=0, atol=1e-9)
-
-
-# For each arm: what to lock, the size of forces, how fast it starts, and how long [s]: in free fall the wrists of the
-# heavier arms whip round ever faster, and no step is small enough for long.
-ARMS = {
-    "finger": (None, 1e-5, 10.0, 1.0),
-    "ur5": (None, 1.0, 1.5, 1.0),
-    "panda": ({"panda_finger_joint1": 0.02}, 0.05, 1.0, 0.4),
-}
-
-
-@pytest.mark.parametrize("name", ["finger", "ur5", "panda"])
-def test_one_stage_is_the_midpoint_rule(name):
-    lock, size, *_ = ARMS[name]
-    robot = vp.load_robot(name, lock=lock)
+@pytest.mark.parametrize(("name", "size"), [("finger", 1e-5), ("ur5", 1.0), ("panda", 0.05)])
+def test_one_stage_is_the_midpoint_rule(name, size):
+    robot = vp.load_robot(name)
     n = robot.dof
     scene = vp.Scene(robot, damping=0.1 * size, stiffness=size, rest=0.3)
     u = size * np.random.default_rng(0).normal(size=(100, n))
@@ -124,37 +83,6 @@ def test_energy_round_off_walks_at_random(stages):
         oscillator(3.0), [1.0], [0.3], dt=2e-2, steps=200_000, integrator=vp.Gauss(stages), check=False
     )
     assert np.abs(motion.energy / motion.energy[0] - 1.0).max() < 50 * np.finfo(float).eps
-
-
-def long_runs(integrator, dt, duration, starts):
-    """Energy errors of chaotic runs in m g n^2 / 2, the share of split steps, and the jets taken."""
-    scene, steps = vp.Scene(vp.planar_chain(3)), round(duration / dt)
-    runs = [
-        vp.simulate(scene, np.full(3, tilt), np.zeros(3), dt=dt, steps=steps, integrator=integrator) for tilt in starts
-    ]
-    split = sum(run.statistics.split_steps for run in runs) / (steps * len(runs))
-    jets = sum(run.statistics.jets.sum() for run in runs)
-    return np.array([run.energy - run.energy[0] for run in runs]) / (GRAVITY * 9 / 2), split, jets
-
-
-@pytest.mark.slow
-def test_energy_of_long_runs_has_no_trend_and_gauss_a_twentieth_of_the_midpoint_rules_error():
-    """1000 s, chaotic, so eight starts within 1e-6 rad are eight independent runs; Gauss at twice the step."""
-    starts = np.arange(8) * 1e-7
-    errors, split, jets = long_runs(vp.Gauss(2), 2e-2, 1000.0, starts)
-    midpoint, midpoint_split, midpoint_jets = long_runs(vp.Midpoint(), 1e-2, 1000.0, starts)
-    assert split <= 0.05
-    assert midpoint_split <= 0.01
-    for each in (errors, midpoint):
-        blocks = each[:, 1:].reshape(8, 20, -1).mean(axis=2)
-        trends = np.polyfit(np.arange(20.0), blocks.T, 1)[0]
-        assert abs(trends.mean()) < 3.5 * trends.std(ddof=1) / np.sqrt(8)
-    assert np.abs(midpoint.mean(axis=1)).max() < 5e-3
-    assert np.abs(midpoint).max() < 5e-2
-    assert np.median(np.abs(errors)) <= np.median(np.abs(midpoint)) / 20
-    assert np.sqrt((errors**2).mean()) <= np.sqrt((midpoint**2).mean()) / 20
-    assert np.abs(errors).max() <= np.abs(midpoint).max() / 20
-    assert jets <= 1.5 * midpoint_jets
 
 
 @pytest.mark.parametrize("stages", [1, 2, 3, 4, 6])

@@ -34,14 +34,6 @@ def write_arm(folder: Path, *links: str | None, extra: str = "", joint: str = LI
     return path
 
 
-def test_a_mesh_that_is_missing_is_told_once(tmp_path):
-    mesh = '<visual><geometry><mesh filename="no.stl"/></geometry></visual>'
-    path = write_arm(tmp_path, ROD, ROD)
-    path.write_text(path.read_text().replace("</inertial>", "</inertial>" + mesh))
-    (warning,) = inspect_robot(path).warnings
-    assert not unnamed(warning, "no.stl", "missing", "'link1'", "'link2'")
-
-
 def test_sound_arm_gives_no_warning_and_its_figures(tmp_path):
     report = inspect_robot(write_arm(tmp_path, ROD, ROD))
     assert report.warnings == ()
@@ -146,18 +138,6 @@ def test_mimic_joints_locked_joints_and_damping_are_said():
     assert inspect_robot("panda", mimic="free").robot.dof == 9
 
 
-def test_continuous_and_prismatic_joints_are_told_apart(tmp_path):
-    text = '<link name="base"/>'
-    for name, kind, parent in (("wheel", "continuous", "base"), ("slider", "prismatic", "wheel_link")):
-        text += f'<link name="{name}_link"><inertial>{ROD}</inertial></link><joint name="{name}" type="{kind}">'
-        text += f'<parent link="{parent}"/><child link="{name}_link"/><axis xyz="1 0 0"/>{LIMIT}</joint>'
-    path = tmp_path / "mixed.urdf"
-    path.write_text(f'<robot name="mixed">{text}</robot>')
-    wheel, slider = inspect_robot(path).joints
-    assert (wheel.kind, wheel.unit, wheel.lower, wheel.upper) == ("continuous", "rad", -np.inf, np.inf)
-    assert (slider.kind, slider.unit, slider.lower, slider.upper) == ("prismatic", "m", -1.0, 2.0)
-
-
 def test_largest_step_of_a_pendulum_standing_up_and_hanging_down(tmp_path):
     path = write_arm(tmp_path, inertial(2.0, 0.01, 0.3, 0.3, x=0.7))
     up = inspect_robot(path, q=-np.pi / 2)
@@ -213,9 +193,3 @@ def test_frames_are_listed_with_what_carries_them():
     assert frames["elbow_joint"] == vp.FrameReport("elbow_joint", "joint", "upper_arm_link", "elbow_joint")
     for name in frames:
         assert f"\n  {name} " in str(report)
-
-
-def test_frames_added_by_hand_are_on_their_joint():
-    first, second, tip = inspect_robot(vp.planar_chain(2)).frames
-    assert (first.parent, second.parent) == ("", "joint1")
-    assert tip == vp.FrameReport("tip", "frame", "joint2", "joint2")

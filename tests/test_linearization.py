@@ -168,20 +168,6 @@ def test_moments_against_samples():
     assert error.max() < 4.0
 
 
-def test_multiplicative_noise_matters_to_the_moments():
-    """A test of the test above: without Gx the covariance is far off."""
-    scene = vp.Scene(vp.load_robot("finger"), noise=vp.StateNoise(1e-2, center=0.0), gravity=False)
-    motion = vp.simulate(scene, [0.4, 0.3, 0.2], [0.0, 0.0, 0.0], dt=5e-3, steps=12)
-    lin = vp.linearize(scene, motion)
-    covariance = np.diag([1e-2] * 3 + [0.0] * 3)
-    full = vp.propagate_moments(lin, covariance=covariance).covariance[-1]
-    additive = vp.Linearization(**{**vars(lin), "Gx": np.zeros_like(lin.Gx)})
-    assert (
-        np.abs(full - vp.propagate_moments(additive, covariance=covariance).covariance[-1]).max()
-        > 0.01 * np.abs(full).max()
-    )
-
-
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4()], ids=str)
 def test_users_can_check_their_own_model(integrator):
     """And the check finds a derivative that is wrong."""

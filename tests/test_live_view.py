@@ -100,29 +100,21 @@ def test_the_robot_is_where_the_motion_is_while_it_is_computed(seen, browser):
 
 
 def test_a_motion_takes_the_time_that_it_would_take(opened, scene, monkeypatch):
-    view = opened(scene, speed=2.0)
+    view = opened(scene, speed=2.0, fps=20.0)
     motion = {"dt": 1e-3, "steps": 1000, "progress": view.progress, "check": False}
     begin = time.monotonic()
     vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], **motion)
     # Nobody looks, so nobody waits.
     assert time.monotonic() - begin < 0.45
     monkeypatch.setattr(live._Window, "watched", property(lambda window: True))
-    begin = time.monotonic()
-    vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], **motion)
-    assert time.monotonic() - begin > 0.45
-
-
-def test_pictures_come_at_their_rate_and_in_order(opened, scene, monkeypatch):
-    monkeypatch.setattr(live._Window, "watched", property(lambda window: True))
-    view = opened(scene, fps=20.0)
-    shown = []
-    move = view._move
+    shown, move = [], view._move
     monkeypatch.setattr(view, "_move", lambda t, q, now, *rest, **last: shown.append(now) or move(t, q, now, *rest))
-    motion = vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=1000, progress=view.progress)
+    begin = time.monotonic()
+    end = vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], **motion).t[-1]
+    assert time.monotonic() - begin > 0.45
     assert shown == sorted(shown)
-    assert len(shown) <= 23
-    assert shown[0] == 0.0
-    assert shown[-1] == motion.t[-1]
+    assert len(shown) <= 13
+    assert shown[-1] == end
 
 
 def test_a_controllers_run_is_shown(opened, chain, scene):
@@ -242,16 +234,6 @@ def test_who_asks_for_nodes_gets_all_of_them_once(scene, options, monkeypatch):
     for before, after in itertools.pairwise(parts):
         assert before.t[-1] == after.t[0]
         np.testing.assert_array_equal(before.q[-1], after.q[0])
-
-
-def test_nodes_of_forces_that_are_called_step_by_step(chain):
-    scene = vp.Scene(chain, forces=[vp.CustomForce(lambda q, v: -0.1 * v)])
-    parts = []
-    motion = vp.simulate(
-        scene, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=60, progress=lambda done, steps, nodes: parts.append(nodes)
-    )
-    rows = np.concatenate([parts[0].q[:1], *(part.q[1:] for part in parts)])
-    np.testing.assert_array_equal(rows, motion.q)
 
 
 def test_functions_of_two_arguments_are_told_as_before(scene, capsys):

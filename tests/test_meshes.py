@@ -95,14 +95,6 @@ def test_every_link_is_named_and_where_was_looked(package, tmp_path, caplog):
     assert not [unnamed(text, *needed) for _, text in missing.values() if unnamed(text, *needed)]
 
 
-def test_a_mesh_that_is_none_beside_one_that_is_not_there(package):
-    (package / "meshes" / "bad.stl").write_text("no mesh")
-    robot = vp.load_robot(two_links(package / "urdf", mesh("../meshes/bad.stl"), mesh("lost.stl")))
-    _, missing = readable_geometry(robot)
-    assert "bad.stl" in missing["l1"][1]
-    assert "link 'l2': lost.stl" in missing["l2"][1]
-
-
 # A box of 0.1 x 0.2 x 0.3 m with a corner at the origin.
 SIDES = np.array([0.1, 0.2, 0.3])
 CORNERS = np.array([[x, y, z] for x in (0.0, 0.1) for y in (0.0, 0.2) for z in (0.0, 0.3)])

@@ -284,19 +284,6 @@ def test_urdf_of_another_suffix_and_sdf(tmp_path, load):
     assert [inertia.mass for inertia in vp.load_robot(path).model.inertias] == [i.mass for i in expected.inertias]
 
 
-def test_planes_are_plates_and_those_without_an_edge_are_left_out(tmp_path):
-    floor = '<geom name="floor" type="plane" size="0 0 0.1"/>'
-    floor += '<geom name="mat" type="plane" size="0.4 0.3 0.1" pos="0 0 -1"/>'
-    strip = default('<geom type="plane"/>'), '<geom name="strip" size="0.4 0 0.1"/>'
-    robot = vp.load_robot(written(tmp_path, document(floor + strip[1] + body("a", MASS + BOX), strip[0])))
-    shapes = {shape.name: shape for shape in geometry(robot).geometryObjects}
-    assert set(shapes) == {"mat", "a_geom0"}
-    plate = shapes["mat"]
-    np.testing.assert_allclose(2.0 * plate.geometry.halfSide, [0.8, 0.6, 1e-3])
-    np.testing.assert_allclose(plate.placement.translation, [0.0, 0.0, -1.0])
-    assert vp.replay(robot, [[0.3]], dt=1.0, html=tmp_path / "page.html").exists()
-
-
 def test_parts_of_the_physics_that_a_file_disables(tmp_path, caplog):
     """Damping, friction and limits are none where MuJoCo has none of them; servos are told as left out."""
     text = """<mujoco><compiler autolimits="true"/><option><flag {}="disable"/></option><worldbody><body><joint name="a"

@@ -116,12 +116,6 @@ STIFF = (
     '<default><equality solref="4e-4 1" solimp="0.9999 0.9999 0.001"/><default class="rod"><joint damping="0.002"/>'
     "</default></default>"
 )
-PIN, HOLE = '<site name="pin" pos="0.4 0 0"/>', '<site name="hole" pos="0.35 0 0"/>'
-FOUR_BAR = document(
-    '<connect site1="pin" site2="hole"/>',
-    STIFF,
-    world=rod("crank", "0 0 0", 0.2, rod("coupler", "0.2 0 0", 0.4, PIN)) + rod("rocker", "0.5 0 0", 0.35, HOLE),
-)
 
 
 def finger(side, x, sign):
@@ -150,11 +144,10 @@ def mujoco_motion(model, data, q, steps, dt):
     return data.qpos.copy(), np.abs(rows(model, data, data.qpos)[0]).max()
 
 
-@pytest.mark.parametrize(("text", "start"), [(FOUR_BAR, [-1.2, 1.0, -1.2]), (GRIPPER, np.zeros(8))])
-def test_motions_are_mujoco_s(tmp_path, text, start):
-    robot, model, data = both(tmp_path, text)
+def test_motions_are_mujoco_s(tmp_path):
+    robot, model, data = both(tmp_path, GRIPPER)
     scene = vp.Scene(robot, constraints="robot", damping="robot")
-    q0 = vp.assemble(scene, start)
+    q0 = vp.assemble(scene, np.zeros(8))
     motion = vp.simulate(scene, q0, np.zeros(robot.dof), dt=0.01, steps=100, integrator=vp.Gauss(3))
     its, miss = mujoco_motion(model, data, q0, 2500, 4e-4)
     assert miss < 1e-7
@@ -177,7 +170,7 @@ def upright(roll: str, offset: float = 0.0) -> str:
     return document('<connect site1="pin" site2="hole"/>', world=crank + rocker)
 
 
-@pytest.mark.parametrize(("roll", "offset"), [("1.5708", 0.0), ("1.5705", 0.0), ("1.5708", 1e-4)])
+@pytest.mark.parametrize(("roll", "offset"), [("1.5705", 0.0), ("1.5708", 1e-4)])
 def test_a_planar_loop_with_rounded_axes_is_closed_in_its_plane(tmp_path, caplog, roll, offset):
     start = [1.2, -1.0, 1.2]
     exact, *_ = both(tmp_path, upright(repr(0.5 * np.pi)))

@@ -191,19 +191,6 @@ def test_overview_has_everything_once(links):
     assert all(legend.get_window_extent().x0 >= right for legend in figure.legends)
 
 
-def test_overview_on_axes_given():
-    robot, trajectory = swing()
-    mine = Figure()
-    grid = mine.subplots(2, 2)
-    figure, axes = plots.plot_trajectory(trajectory, axes=grid, robot=robot)
-    assert figure is mine
-    assert list(axes) == list(grid.ravel())
-    assert axes[0].get_legend() is not None
-    assert not mine.legends
-    with refused(vp.InputError, "axes", "4", "3"):
-        plots.plot_trajectory(trajectory, axes=list(grid.ravel()[:3]))
-
-
 def test_what_is_no_motion_record_robot_or_axes_is_refused():
     robot, trajectory = swing(links=2, steps=3, controls=[0.1, 0.2])
     of_motions = [plots.plot_trajectory, *SINGLE.values()]
@@ -306,9 +293,6 @@ def test_limits_have_an_entry_in_every_legend():
     figure, axes = plots.plot_trajectory(motion, robot=limited)
     assert legend_of(figure) == ["joint1", "limits"]
     assert [legend_of(panel) for panel in axes] == [[]] * 3
-    grid = Figure().subplots(4, 1)
-    plots.plot_trajectory(motion, axes=grid, robot=limited)
-    assert [legend_of(panel) for panel in grid] == [[], ["joint1", "limits"], [], []]
 
 
 def limit_lines(trajectory, robot):

@@ -65,15 +65,6 @@ def test_idle_fingers_are_left_out_and_the_answer_is_the_same(tmp_path):
     assert np.ptp(everything.trajectory.q[:, others], axis=0).max() < 1e-12
 
 
-def test_motion_is_the_same_without_idle_fingers(tmp_path):
-    more = '[simulate]\ncontrols = { "joint_1.0" = 0.05 }\n'
-    path = hand(tmp_path, [], more=more)
-    file, whole = vp.load_scene(path), vp.load_scene(path, required_only=False)
-    assert file.robot.joint_names == INDEX
-    own = columns(whole, INDEX)
-    np.testing.assert_allclose(file.simulate().q, whole.simulate().q[:, own], rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("change", "joints"),
     [
@@ -97,22 +88,6 @@ def test_what_touches_a_finger(change, joints, tmp_path):
 def test_fingers_are_independent(tmp_path):
     file = vp.load_scene(hand(tmp_path, ["joint_1.0", "joint_13.0"]))
     assert file.required.parts == (INDEX, THUMB)
-
-
-@pytest.mark.parametrize(
-    ("text", "integrator"),
-    [
-        ('type = "gauss"\nstages = 3\nkick = "split"', vp.Gauss(stages=3, kick="split")),
-        ('type = "midpoint"\nalpha = 0.3\nkick = "split"', vp.Midpoint(alpha=0.3, kick="split")),
-    ],
-)
-def test_integrators(text, integrator, tmp_path):
-    file = vp.load_scene(hand(tmp_path, ["joint_1.0"], more=f"[integrator]\n{text}"))
-    assert file.problem.integrator == integrator
-
-
-def test_robot_at_rest_is_all_of_the_scene(tmp_path):
-    assert vp.load_scene(hand(tmp_path, [])).robot.dof == 16
 
 
 def test_locked_joints_are_no_bodies():

@@ -83,10 +83,6 @@ class TestPlanar:
         held = vp.load_robot("panda", base="planar", lock={"base_x": 0.5, "base_y": 0.0, "base_turn": 0.2})
         assert held.dof == vp.load_robot("panda").dof
 
-    def test_a_name_that_is_taken(self):
-        with refused(vp.InputError, "base_turn"):
-            vp.load_robot(vp.load_robot("ur5", base="planar").model, base="planar")
-
 
 class TestArmature:
     def test_it_adds_to_the_diagonal(self):

@@ -183,23 +183,7 @@ def test_monte_carlo_against_paths_one_by_one():
     sol = vp.solve(problem)
     rng = np.random.default_rng(3)
     for feedback, controls in ((True, sol.policy), (False, sol.controls)):
-        costs = np.array(
-            [
-                problem.cost_of(
-                    vp.simulate(
-                        problem.scene,
-                        problem.q0,
-                        problem.v0,
-                        dt=0.03,
-                        steps=40,
-                        controls=controls,
-                        rng=rng,
-                        check=False,
-                    )
-                )
-                for _ in range(1000)
-            ]
-        )
+        costs = np.array([problem.cost_of(problem.simulate(controls, rng=rng)) for _ in range(1000)])
         found = sol.monte_carlo(1000, 5, feedback=feedback)
         error = costs.std(ddof=1) / np.sqrt(1000)
         assert found.standard_error == pytest.approx(error, rel=0.3)

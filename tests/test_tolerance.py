@@ -68,6 +68,11 @@ def test_error_at_all_nodes_is_within_the_tolerance_and_told(wish):
     assert motion.t[-1] == pytest.approx(1.0, rel=1e-12)
 
 
+def test_no_more_steps_are_taken_than_the_order_asks_for():
+    motion = vp.simulate(chain(), [0.5, 0.0, -0.3], REST, duration=0.5, tolerance=1e-4, integrator=vp.Midpoint())
+    assert 0.3e-4 < motion.accuracy.error <= 1e-4
+
+
 def test_torques_of_time_are_right_in_continuous_time():
     """They are taken at the stages of each step, in whose weights u has their mean."""
     scene = chain()

@@ -136,7 +136,7 @@ class TestOdd:
             robot = vp.load_robot(path)
         assert not facts or naming(caplog.messages, facts)
         assert bool(facts) == bool(caplog.records)
-        if kind not in ("entities", "utf-16", "a number with blanks"):  # of which Pinocchio's parser reads nothing
+        if kind != "a number with blanks":  # of which Pinocchio's parser reads nothing
             assert_same(robot.free_model, pin.buildModelFromUrdf(str(path)))
         assert robot.joint_names == ("j1",)
         (tie,) = robot.ties
@@ -147,10 +147,9 @@ class TestOdd:
         assert len(report.joints) == 2
         assert not facts or naming((*report.warnings, *caplog.messages), facts)
 
-    @pytest.mark.parametrize("encoding", ["iso-8859-1", "latin-1", "cp1252", "UTF-8"])
-    def test_names_in_the_encoding_that_is_declared(self, tmp_path, two, caplog, encoding):
-        text = two.replace("?>", f" encoding='{encoding}' ?>", 1).replace('"j1"', '"épaule"')
-        robot = vp.load_robot(written(tmp_path, text, encoding))
+    def test_names_in_the_encoding_that_is_declared(self, tmp_path, two, caplog):
+        text = two.replace("?>", " encoding='latin-1' ?>", 1).replace('"j1"', '"épaule"')
+        robot = vp.load_robot(written(tmp_path, text, "latin-1"))
         assert robot.joint_names == ("épaule",)
         assert not caplog.records
 
@@ -399,8 +398,8 @@ class TestInertia:
 
 
 class TestMany:
-    @pytest.mark.parametrize("joints", [300, pytest.param(1000, marks=pytest.mark.slow)])
-    def test_joints_load_and_step(self, joints):
+    def test_joints_load_and_step(self):
+        joints = 300
         robot = vp.planar_chain(joints, length=1.0 / joints, mass=1.0 / joints)
         assert robot.dof == joints
         # Stretched out along x, the tip is 1 m away; of a quarter circle, a chord away.

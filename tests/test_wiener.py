@@ -220,6 +220,12 @@ def test_velocity_dependent_noise_converges_to_the_stratonovich_limit(kick):
     assert spreads[1] < 0.65 * spreads[0]
 
 
+def test_a_split_kick_takes_half_of_its_correction():
+    """Of 1/2 over a second: the whole or none of it moves log v as much."""
+    logs, w = geometric_logs("split", derivative_of_geometric_noise, 50, paths=10)
+    assert abs((logs - RATE * w).mean()) < 0.2
+
+
 def test_velocity_dependent_noise_without_its_correction_converges_to_the_ito_limit():
     """Without dv log v - RATE w goes to -RATE^2 t / 2 instead."""
     for steps in (50, 200):

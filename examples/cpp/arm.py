@@ -17,7 +17,7 @@ HEADER = """// Written by arm.py: {robot}.
 #include <cmath>
 #include <vector>
 
-#include "varpin/tree.hpp"
+#include "varpin/mechanism.hpp"
 
 inline varpin::Mechanism arm() {{
     varpin::Mechanism out;

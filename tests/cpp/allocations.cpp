@@ -200,7 +200,7 @@ bool allocates_nothing(const varpin::Mechanism& mechanism) {
 // A chain whose tip slides along a line, from rest.
 bool constrained_steps_allocate_nothing() {
     varpin::Mechanism mechanism = chain();
-    const varpin::CarriedVector tip{n - 1, {1.0, 0.0, 0.0}}, across{-1, {0.0, 1.0, 0.0}, true};
+    const varpin::Anchor tip{n - 1, {1.0, 0.0, 0.0}}, across{-1, {0.0, 1.0, 0.0}, true};
     const double q0[n] = {0.4, 0.3, -0.5}, v0[n] = {}, h = 0.001;
     const double height = std::sin(0.4) + std::sin(0.7) + std::sin(0.2);
     mechanism.constraints = {

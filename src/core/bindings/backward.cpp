@@ -1,10 +1,6 @@
 // Backward passes: on the Hessian of the value, and on its square root.
 #include "varpin/backward.hpp"
 
-#include <nanobind/stl/optional.h>
-
-#include <optional>
-
 #include "arrays.hpp"
 #include "registrations.hpp"
 #include "varpin/square_root.hpp"
@@ -22,74 +18,6 @@ std::size_t decisions_of(std::size_t N, int hold) {
         throw std::invalid_argument("hold does not divide the steps");
     return N / static_cast<std::size_t>(hold);
 }
-
-// Steps with references to their arrays.
-struct HeldSteps {
-    HeldSteps(In<3> A_, In<3> B_, In<3> G_, In<4> Gx_, In<4> Gu_, In<2> gradient_, In<3> hessian_)
-        : A(A_), B(B_), G(G_), Gx(Gx_), Gu(Gu_), gradient(gradient_), hessian(hessian_) {
-        const std::size_t N = A.shape(0), x = A.shape(1), m = B.shape(2), k = G.shape(2), size = x + m;
-        if (x % 2 != 0) throw std::invalid_argument("A has an odd number of states");
-        require(A, "A", {N, x, x});
-        require(B, "B", {N, x, m});
-        require(G, "G", {N, x, k});
-        require(Gx, "Gx", {N, x, k, x});
-        require(Gu, "Gu", {N, x, k, m});
-        require(gradient, "gradient", {N, size});
-        const bool one_hessian = hessian.shape(0) == 1;
-        require(hessian, "hessian", {one_hessian ? 1 : N, size, size});
-        steps = {.steps = static_cast<std::ptrdiff_t>(N),
-                 .dof = static_cast<int>(x / 2),
-                 .controls = static_cast<int>(m),
-                 .processes = static_cast<int>(k),
-                 .A = A.data(),
-                 .B = B.data(),
-                 .G = G.data(),
-                 .Gx = Gx.data(),
-                 .Gu = Gu.data(),
-                 .gradient = gradient.data(),
-                 .hessian = hessian.data(),
-                 .one_hessian = one_hessian};
-    }
-
-    In<3> A, B, G;
-    In<4> Gx, Gu;
-    In<2> gradient;
-    In<3> hessian;
-    ExpandedSteps steps;
-};
-
-// Arrays of gains to be filled in.
-struct HeldGains {
-    HeldGains(InOut<2> feedforward_, InOut<3> feedback_, InOut<2> control_gradient_, InOut<3> spread_,
-              std::optional<InOut<3>> factors_)
-        : feedforward(feedforward_),
-          feedback(feedback_),
-          control_gradient(control_gradient_),
-          spread(spread_),
-          factors(factors_) {}
-
-    // Views, after a check that the arrays fit these steps, with each control held over `hold` of them.
-    Gains fitting(const HeldSteps& held, int hold) const {
-        const ExpandedSteps& steps = held.steps;
-        const auto N = static_cast<std::size_t>(steps.steps), R = decisions_of(N, hold);
-        const auto x = static_cast<std::size_t>(steps.states()), m = static_cast<std::size_t>(steps.controls);
-        if (steps.processes > 0) require(spread, "spread", {N, x, x});
-        require(feedforward, "feedforward", {R, m});
-        require(feedback, "feedback", {R, m, x});
-        require(control_gradient, "control_gradient", {R, m});
-        return {.feedforward = feedforward.data(),
-                .feedback = feedback.data(),
-                .control_gradient = control_gradient.data(),
-                .spread = spread.data(),
-                .factors = factors && given(*factors, "factors", {R, m, m}) ? factors->data() : nullptr};
-    }
-
-    InOut<2> feedforward;
-    InOut<3> feedback;
-    InOut<2> control_gradient;
-    InOut<3> spread;
-    std::optional<InOut<3>> factors;
-};
 
 void make_pass(BackwardPass* self, int controls, In<1> gradient, In<2> hessian) {
     const std::size_t x = gradient.shape(0);
@@ -124,27 +52,50 @@ void make_root_pass(RootPass* self, int controls, const HeldSquares& terminal, I
     new (self) RootPass(static_cast<int>(x / 2), controls, terminal.fitting("terminal", 1, x), gradient.data());
 }
 
-template <class Pass>
-void require_same(const Pass& pass, const HeldSteps& given) {
-    if (given.steps.dof != pass.dof() || given.steps.controls != pass.controls())
+// A pass over steps, whose gains are written to arrays; see steps.hpp. `running` are the costs of a RootPass.
+template <class Pass, class... Running>
+std::ptrdiff_t run(Pass& pass, double h, int hold, double regularization, In<3> A, In<3> B, In<3> G, In<4> Gx, In<4> Gu,
+                   In<2> gradient, In<3> hessian, InOut<2> feedforward, InOut<3> feedback, InOut<2> control_gradient,
+                   InOut<3> spread, InOut<3> factors, const Running&... running) {
+    const std::size_t N = A.shape(0), x = A.shape(1), m = B.shape(2), k = G.shape(2), size = x + m;
+    const std::size_t R = decisions_of(N, hold);
+    if (x != 2 * static_cast<std::size_t>(pass.dof()) || m != static_cast<std::size_t>(pass.controls()))
         throw std::invalid_argument("the steps have other states or controls than the pass");
-}
-
-std::ptrdiff_t run(BackwardPass& pass, double h, int hold, double regularization, const HeldSteps& given,
-                   const HeldGains& held) {
-    require_same(pass, given);
-    const Gains gains = held.fitting(given, hold);
-    nb::gil_scoped_release release;
-    return pass.run(h, hold, regularization, given.steps, gains);
-}
-
-std::ptrdiff_t run_on_roots(RootPass& pass, double h, int hold, double regularization, const HeldSteps& given,
-                            const HeldGains& held, const HeldSquares& running) {
-    require_same(pass, given);
-    const Gains gains = held.fitting(given, hold);
-    const Squares costs = running.fitting("running", given.gradient.shape(0), given.gradient.shape(1));
-    nb::gil_scoped_release release;
-    return pass.run(h, hold, regularization, given.steps, costs, gains);
+    require(A, "A", {N, x, x});
+    require(B, "B", {N, x, m});
+    require(G, "G", {N, x, k});
+    require(Gx, "Gx", {N, x, k, x});
+    require(Gu, "Gu", {N, x, k, m});
+    require(gradient, "gradient", {N, size});
+    const bool one_hessian = hessian.shape(0) == 1;
+    require(hessian, "hessian", {one_hessian ? 1 : N, size, size});
+    require(feedforward, "feedforward", {R, m});
+    require(feedback, "feedback", {R, m, x});
+    require(control_gradient, "control_gradient", {R, m});
+    if (k > 0) require(spread, "spread", {N, x, x});
+    require(factors, "factors", {R, m, m});
+    const ExpandedSteps steps{.steps = static_cast<std::ptrdiff_t>(N),
+                              .dof = pass.dof(),
+                              .controls = pass.controls(),
+                              .processes = static_cast<int>(k),
+                              .A = A.data(),
+                              .B = B.data(),
+                              .G = G.data(),
+                              .Gx = Gx.data(),
+                              .Gu = Gu.data(),
+                              .gradient = gradient.data(),
+                              .hessian = hessian.data(),
+                              .one_hessian = one_hessian};
+    const Gains gains{.feedforward = feedforward.data(),
+                      .feedback = feedback.data(),
+                      .control_gradient = control_gradient.data(),
+                      .spread = spread.data(),
+                      .factors = factors.data()};
+    const auto each = [&](const auto&... costs) {
+        nb::gil_scoped_release release;
+        return pass.run(h, hold, regularization, steps, costs..., gains);
+    };
+    return each(running.fitting("running", N, size)...);
 }
 
 // The changes of the controls, moves (R, m), and the states after each step, after (N, 2n), of a linearized motion
@@ -171,9 +122,13 @@ bool foresee(int hold, In<3> A, In<3> B, In<2> feedforward, In<3> feedback, In<3
     return predict(plan, moves.data(), after.data());
 }
 
-template <class Pass>
-void define_results(nb::class_<Pass>& type) {
-    type.def_prop_ro("slope", [](const Pass& pass) { return pass.found.slope; })
+// The members of a pass; `more` are arguments of its run beside the common ones.
+template <class Pass, class Run, class... More>
+void define(nb::class_<Pass>& type, Run run, More... more) {
+    type.def("run", run, "h"_a, "hold"_a, "regularization"_a, nb::kw_only(), "A"_a, "B"_a, "G"_a, "Gx"_a, "Gu"_a,
+             "gradient"_a, "hessian"_a, "feedforward"_a.noconvert(), "feedback"_a.noconvert(),
+             "control_gradient"_a.noconvert(), "spread"_a.noconvert(), "factors"_a.noconvert(), more...)
+        .def_prop_ro("slope", [](const Pass& pass) { return pass.found.slope; })
         .def_prop_ro("curvature", [](const Pass& pass) { return pass.found.curvature; })
         .def_prop_ro("noise", [](const Pass& pass) { return pass.found.noise; })
         .def_prop_ro("loss", [](const Pass& pass) { return pass.found.loss; });
@@ -182,22 +137,13 @@ void define_results(nb::class_<Pass>& type) {
 }  // namespace
 
 void register_backward(nb::module_& m) {
-    nb::class_<HeldSteps>(m, "ExpandedSteps")
-        .def(nb::init<In<3>, In<3>, In<3>, In<4>, In<4>, In<2>, In<3>>(), nb::kw_only(), "A"_a, "B"_a, "G"_a, "Gx"_a,
-             "Gu"_a, "gradient"_a, "hessian"_a);
-    nb::class_<HeldGains>(m, "Gains")
-        .def(nb::init<InOut<2>, InOut<3>, InOut<2>, InOut<3>, std::optional<InOut<3>>>(), nb::kw_only(),
-             "feedforward"_a.noconvert(), "feedback"_a.noconvert(), "control_gradient"_a.noconvert(),
-             "spread"_a.noconvert(), "factors"_a.noconvert().none() = nb::none());
     nb::class_<HeldSquares>(m, "Squares").def(nb::init<In<3>, In<2>, In<2>>(), "root"_a, "shift"_a, "linear"_a);
     auto pass = nb::class_<BackwardPass>(m, "BackwardPass");
-    pass.def("__init__", &make_pass, "controls"_a, "gradient"_a, "hessian"_a)
-        .def("run", &run, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a);
-    define_results(pass);
+    pass.def("__init__", &make_pass, "controls"_a, "gradient"_a, "hessian"_a);
+    define(pass, &run<BackwardPass>);
     auto root_pass = nb::class_<RootPass>(m, "RootPass");
-    root_pass.def("__init__", &make_root_pass, "controls"_a, "terminal"_a, "gradient"_a)
-        .def("run", &run_on_roots, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a, "running"_a);
-    define_results(root_pass);
+    root_pass.def("__init__", &make_root_pass, "controls"_a, "terminal"_a, "gradient"_a);
+    define(root_pass, &run<RootPass, HeldSquares>, "running"_a);
     m.def("foresee", &foresee, "hold"_a, "A"_a, "B"_a, "feedforward"_a, "feedback"_a, "slack"_a, "moves"_a.noconvert(),
           "after"_a.noconvert());
 }

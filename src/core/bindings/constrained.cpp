@@ -1,14 +1,12 @@
 // Steppers under holonomic constraints, and the derivatives of their steps.
-#include "constrained.hpp"
-
 #include <cstdint>
 #include <memory>
 #include <tuple>
 #include <vector>
 
 #include "registrations.hpp"
-#include "small_arms.hpp"
 #include "steps_at.hpp"
+#include "units.hpp"
 #include "varpin/constrained_linearization.hpp"
 
 namespace varpin::border {

@@ -138,10 +138,9 @@ BoundRollout rollout(SharedMechanism mechanism, ExplicitMethod method, In<2> q, 
 }
 
 bool first_nodes(BoundRollout& rollout, nb::handle nodes) {
-    const NodeArrays arrays(*rollout.mechanism, nodes);
-    arrays.require_paths(static_cast<std::size_t>(rollout.core.paths()));
-    if (arrays.steps() < 1) throw std::invalid_argument("the nodes have no rows for the first nodes");
-    return rollout.core.first_nodes(arrays.view());
+    const Nodes to = nodes_of(*rollout.mechanism, nodes, static_cast<std::size_t>(rollout.core.paths()));
+    if (to.steps < 1) throw std::invalid_argument("the nodes have no rows for the first nodes");
+    return rollout.core.first_nodes(to);
 }
 
 void roll(BoundRollout& rollout, double dt, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes,

@@ -19,9 +19,10 @@
 #include "arrays.hpp"
 #include "bodies.hpp"
 #include "registrations.hpp"
-#include "small_arms.hpp"
+#include "units.hpp"
 #include "varpin/dense.hpp"
 #include "varpin/jet.hpp"
+#include "varpin/kernels.hpp"
 
 namespace varpin::border {
 

@@ -13,11 +13,10 @@
 #include <vector>
 
 #include "arrays.hpp"
-#include "constrained.hpp"
 #include "registrations.hpp"
 #include "rollout_arrays.hpp"
-#include "small_arms.hpp"
 #include "steps_at.hpp"
+#include "units.hpp"
 #include "varpin/linearization.hpp"
 
 namespace varpin::border {

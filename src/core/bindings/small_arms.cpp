@@ -1,6 +1,5 @@
 // The inner loops of arms with up to seven joints, whose number is known at compile time.
-#include "small_arms.hpp"
-
+#include "units.hpp"
 #include "varpin/guards.hpp"
 #include "varpin/step_equation.hpp"
 

@@ -85,7 +85,7 @@ def _plot(path: Path, robot: Robot, trajectory: Trajectory) -> None:
 
     figure, _ = plot_trajectory(trajectory, robot=robot)
     with atomic_file(path) as stream:
-        figure.savefig(stream, format=path.suffix[1:].lower(), dpi=150)  # type: ignore[union-attr]
+        figure.savefig(stream, format=path.suffix[1:].lower(), dpi=150)
 
 
 def _show(

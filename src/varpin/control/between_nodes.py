@@ -9,6 +9,7 @@ cubics through the steps instead, which take hardly any time.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError
 from varpin.integrators import Integrator
 from varpin.integrators.base import Segment
+from varpin.io.archive import Axes
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene, quiet
@@ -307,8 +309,8 @@ class Instants(Frozen):
         cubic: Whether rows are on the cubics through the steps, at their middles, not of steps integrated in parts.
     """
 
-    rows: Integers
-    moments: Floats
+    rows: Annotated[Integers, Axes("instants", 3)]
+    moments: Annotated[Floats, Axes("moments", finite=True)]
     cubic: bool = False
 
     def __post_init__(self) -> None:

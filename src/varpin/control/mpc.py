@@ -524,11 +524,5 @@ def _margins(problem: OptimalControlProblem, previous: Solution, known: Multipli
         backoff.append(values[np.minimum(rows, len(old.places) - 1)])
     # Between nodes as at the end of the step.
     backoff += [backoff[i][instants.of(i)[:, 0]] for i in instants.constraints]
-    some = len(instants.rows) > 0
-    return Multipliers(
-        values=np.zeros(sum(item.size for item in enforced(problem, instants).bound_constraints)),
-        backoff=flat(backoff),
-        instants=instants.rows if some else None,
-        moments=instants.moments if some else None,
-        cubic=instants.cubic,
-    )
+    size = sum(item.size for item in enforced(problem, instants).bound_constraints)
+    return Multipliers(values=np.zeros(size), backoff=flat(backoff), between=instants)

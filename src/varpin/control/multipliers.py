@@ -9,8 +9,8 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.arrays import Floats, Integers
-from varpin.control.between_nodes import NOWHERE, Instants, enforced
+from varpin.arrays import Floats
+from varpin.control.between_nodes import Instants, enforced
 from varpin.control.constraints import BoundConstraint
 from varpin.control.problem import OptimalControlProblem
 from varpin.io.archive import Axes
@@ -33,33 +33,20 @@ class Multipliers(Frozen):
     Attributes:
         values: Multipliers of the plan's motion (M,) [cost / unit of the constraint].
         backoff: ``margin`` standard deviations (M,), and what is ``added`` to them, in the constraint's unit.
-        instants: Constraint, step and number (I, 3) of each instant between nodes at which a constraint has rows; None
-            where all hold there without.
-        moments: Where these rows are in a step of unit length (O,); negative for rows that are not enforced.
-        cubic: Whether these rows are on the cubics through the steps, as in a controller's ticks, not of steps
-            integrated in parts.
+        between: The rows between nodes.
         added: What is added to margins of the rows at nodes, as motions under noise were counted; None where margins of
             the linear model suffice.
     """
 
     values: Annotated[Floats, Axes("rows", finite=True)]
     backoff: Annotated[Floats, Axes("rows", finite=True)]
-    instants: Annotated[Integers, Axes("instants", 3)] | None = None
-    moments: Annotated[Floats, Axes("moments", finite=True)] | None = None
-    cubic: bool = False
+    between: Instants
     added: Annotated[Floats, Axes("node_rows", finite=True)] | None = None
 
     def __post_init__(self) -> None:
-        for array in (self.values, self.backoff, self.instants, self.moments, self.added):
+        for array in (self.values, self.backoff, self.added):
             if array is not None:
                 array.setflags(write=False)
-
-    @property
-    def between(self) -> Instants:
-        """The rows between nodes."""
-        if self.instants is None or self.moments is None:
-            return NOWHERE
-        return Instants(self.instants, self.moments, self.cubic)
 
 
 @dataclass(frozen=True, eq=False)

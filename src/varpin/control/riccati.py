@@ -83,33 +83,29 @@ def _pass(steps: Steps, given: Recursion, regularization: float, *, second: bool
     if second and problem.integrator.variational:
         pull = end.cost.gradient[:, x // 2 :]
         hessian[:x, :x] += velocity_curvature(problem.scene, motion.q[-1:], motion.v[-1:], pull)[0]
-    found: core.BackwardPass | core.RootPass = core.BackwardPass(m, gradient, hessian)
-    squares: tuple[core.Squares, ...] = ()
+    feedforward, gains, by_controls = np.empty((R, m)), np.empty((R, m, X)), np.empty((R, m))
+    spread, factors = np.empty((S if k else 0, X, X)), np.empty((R, m, m))
+    given_arrays = {
+        "A": given.J[:, :, :X],
+        "B": given.J[:, :, X:],
+        "G": given.G,
+        "Gx": given.Gz[..., :X],
+        "Gu": given.Gz[..., X:],
+        "gradient": given.gradient,
+        "hessian": given.hessian,
+    }
+    found_arrays = {"feedforward": feedforward, "feedback": gains, "control_gradient": by_controls}
+    arrays = {**given_arrays, **found_arrays, "spread": spread, "factors": factors}
+    found: core.BackwardPass | core.RootPass
     if roots:
         final, running = squares_of(end.cost.gradient, end.cost.hessian), squares_of(given.gradient, given.hessian)
         if final is None or running is None:
             return None
-        found, squares = core.RootPass(m, final.after(end.slopes).padded(X).core, gradient), (running.core,)
-    feedforward, gains, by_controls = np.empty((R, m)), np.empty((R, m, X)), np.empty((R, m))
-    spread, factors = np.empty((S if k else 0, X, X)), np.empty((R, m, m))
-    failed = found.run(
-        problem.dt,
-        problem.hold,
-        float(regularization),
-        core.ExpandedSteps(
-            A=np.ascontiguousarray(given.J[:, :, :X]),
-            B=np.ascontiguousarray(given.J[:, :, X:]),
-            G=given.G,
-            Gx=np.ascontiguousarray(given.Gz[..., :X]),
-            Gu=np.ascontiguousarray(given.Gz[..., X:]),
-            gradient=given.gradient,
-            hessian=given.hessian,
-        ),
-        core.Gains(
-            feedforward=feedforward, feedback=gains, control_gradient=by_controls, spread=spread, factors=factors
-        ),
-        *squares,
-    )
+        found = core.RootPass(m, final.after(end.slopes).padded(X).core, gradient)
+        failed = found.run(problem.dt, problem.hold, float(regularization), running=running.core, **arrays)
+    else:
+        found = core.BackwardPass(m, gradient, hessian)
+        failed = found.run(problem.dt, problem.hold, float(regularization), **arrays)
     if failed >= 0 or not (math.isfinite(found.slope) and math.isfinite(found.curvature)):
         return None
     jumps, noise = np.empty((0, x, x // 2)), found.noise
@@ -128,10 +124,11 @@ def foreseen(steps: Steps, plan: Plan) -> tuple[Floats, bool]:
     problem, given = steps.problem, steps.recursion(None, None)
     (S, X, _), layout = given.J.shape, Layout.of(problem)
     R, m = plan.feedforward.shape
-    A, B = (np.ascontiguousarray(part) for part in (given.J[:, :, :X], given.J[:, :, X:]))
     slack = steps.slack if problem.limited else np.zeros((0, 2, m))
     moves, after = np.empty((R, m)), np.empty((S, X))
-    limited = core.foresee(problem.hold, A, B, plan.feedforward, plan.gains, slack, moves, after)
+    limited = core.foresee(
+        problem.hold, given.J[:, :, :X], given.J[:, :, X:], plan.feedforward, plan.gains, slack, moves, after
+    )
     x = np.vstack([np.zeros((1, layout.states)), after[:, : layout.states]])
     return layout.joined(x[-layout.stages - 1 :], moves), limited
 

@@ -713,13 +713,10 @@ class Search:
             previous = np.zeros((R, m, m)) if plan is None or plan.previous is None else plan.previous
         known = None
         if problem.constraints:
-            some = len(self.between.rows) > 0
             known = Multipliers(
                 values=flat(self.multipliers),
                 backoff=flat(self.backoff),
-                instants=self.between.rows if some else None,
-                moments=self.between.moments if some else None,
-                cubic=self.between.cubic,
+                between=self.between,
                 added=None if self.added is None else flat(self.added),
             )
         reason = self.reason

@@ -203,8 +203,8 @@ def verify(
         planned_cost=planned_cost,
         open_loop_cost=found.opened.cost,
         closed_loop_cost=found.closed.cost,
-        open_loop_gap=float(np.abs(found.opened.end - plan.q[-1]).max()),
-        closed_loop_gap=float(np.abs(found.closed.end - plan.q[-1]).max()),
+        open_loop_gap=float(np.abs(found.opened.nodes[-1] - plan.q[-1]).max()),
+        closed_loop_gap=float(np.abs(found.closed.nodes[-1] - plan.q[-1]).max()),
         defect=_defect(problem, plan, found.substeps, found.integrator),
         substeps=found.substeps,
         accuracy=found.accuracy,
@@ -241,12 +241,14 @@ class Outside(NamedTuple):
 
 
 class Played(NamedTuple):
-    """A motion under commands in parts of a plan's steps: its cost, NaN where it diverges, its end and violations."""
+    """A motion under commands in parts of a plan's steps: its cost, violations and configurations at the plan's nodes.
+
+    All are NaN where it diverges.
+    """
 
     cost: float
-    end: Floats
     outside: list[Outside]
-    nodes: Floats  # configurations at the plan's nodes
+    nodes: Floats
 
 
 def played(
@@ -256,9 +258,9 @@ def played(
     motion, failure = rollout(fine.scene, integrator, fine.q0, fine.v0, commands, fine.dt)
     if failure is not None:
         lost = np.full((1, fine.q0.size), np.nan)
-        return Played(np.nan, lost[0], [Outside(bound) for bound in fine.bound_constraints], lost)
+        return Played(np.nan, [Outside(bound) for bound in fine.bound_constraints], lost)
     cost = float(fine.costs(motion.q, motion.v, fine.control_rows(motion)))
-    return Played(cost, motion.q[-1], _outside(problem, fine, motion), motion.q[:: fine.steps // problem.steps])
+    return Played(cost, _outside(problem, fine, motion), motion.q[:: fine.steps // problem.steps])
 
 
 def _outside(problem: OptimalControlProblem, fine: OptimalControlProblem, motion: Trajectory) -> list[Outside]:

@@ -2,11 +2,9 @@
 
 from varpin.core._core import BackwardPass as BackwardPass
 from varpin.core._core import CostTerms as CostTerms
-from varpin.core._core import ExpandedSteps as ExpandedSteps
 from varpin.core._core import ExplicitMethod as ExplicitMethod
 from varpin.core._core import ExplicitRollout as ExplicitRollout
 from varpin.core._core import ForwardDynamics as ForwardDynamics
-from varpin.core._core import Gains as Gains
 from varpin.core._core import Guards as Guards
 from varpin.core._core import Links as Links
 from varpin.core._core import Mechanism as Mechanism

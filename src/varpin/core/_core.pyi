@@ -15,7 +15,7 @@ Bytes = NDArray[np.uint8]
 class Mechanism:
     """A tree of bodies with the forces, constraints, actuation and noise of a scene.
 
-    The fields are described in src/core/include/varpin/tree.hpp.
+    The fields are described in src/core/include/varpin/mechanism.hpp.
     """
 
     @staticmethod
@@ -205,42 +205,6 @@ def constrained_derivatives(
     With ``ramp`` those in the force are those in the one that grows.
     """
 
-class ExpandedSteps:
-    """The linearized dynamics and the expanded costs of N steps.
-
-    The fields are described in src/core/include/varpin/steps.hpp.
-    """
-
-    def __init__(
-        self,
-        *,
-        A: Floats,
-        B: Floats,
-        G: Floats,
-        Gx: Floats,
-        Gu: Floats,
-        gradient: Floats,
-        hessian: Floats,
-    ) -> None:
-        """Raises ValueError for arrays that do not fit each other."""
-
-class Gains:
-    """Arrays of R decisions and N steps that a backward pass fills in, for u + k + K (x - x_nominal).
-
-    ``feedforward`` (R, m), ``feedback`` (R, m, 2n), ``control_gradient`` (R, m) of the cost, and with noise
-    ``spread`` (N, 2n, 2n), S. On request ``factors`` (R, m, m), L D L' of the regularized Quu.
-    """
-
-    def __init__(
-        self,
-        *,
-        feedforward: Floats,
-        feedback: Floats,
-        control_gradient: Floats,
-        spread: Floats,
-        factors: Floats | None = None,
-    ) -> None: ...
-
 class Squares:
     """N functions (1/2) |L z + r|^2 + c . z: root L (N, z, z) or (1, z, z), shift r and linear c (N, z)."""
 
@@ -264,10 +228,31 @@ class BackwardPass(_Found):
     """The recursion from the terminal cost's gradient (2n,) and Hessian (2n, 2n) in x."""
 
     def __init__(self, controls: int, gradient: Floats, hessian: Floats) -> None: ...
-    def run(self, h: float, hold: int, regularization: float, steps: ExpandedSteps, gains: Gains) -> int:
-        """Pass over a block of steps, the last block first; returns -1, or the decision without a minimum.
+    def run(
+        self,
+        h: float,
+        hold: int,
+        regularization: float,
+        *,
+        A: Floats,
+        B: Floats,
+        G: Floats,
+        Gx: Floats,
+        Gu: Floats,
+        gradient: Floats,
+        hessian: Floats,
+        feedforward: Floats,
+        feedback: Floats,
+        control_gradient: Floats,
+        spread: Floats,
+        factors: Floats,
+    ) -> int:
+        """Pass over a block of N steps, the last block first; returns -1, or the decision without a minimum.
 
-        Each control is held over ``hold`` steps.
+        Each control is held over ``hold`` steps, for R decisions. The linearized dynamics and the expanded costs are
+        described in src/core/include/varpin/steps.hpp. Written are the gains of u + k + K (x - x_nominal),
+        ``feedforward`` (R, m) and ``feedback`` (R, m, 2n); ``control_gradient`` (R, m) of the cost; with noise
+        ``spread`` (N, 2n, 2n), S; and ``factors`` (R, m, m), L D L' of the regularized Quu.
         """
 
 class RootPass(_Found):
@@ -279,8 +264,19 @@ class RootPass(_Found):
         h: float,
         hold: int,
         regularization: float,
-        steps: ExpandedSteps,
-        gains: Gains,
+        *,
+        A: Floats,
+        B: Floats,
+        G: Floats,
+        Gx: Floats,
+        Gu: Floats,
+        gradient: Floats,
+        hessian: Floats,
+        feedforward: Floats,
+        feedback: Floats,
+        control_gradient: Floats,
+        spread: Floats,
+        factors: Floats,
         running: Squares,
     ) -> int:
         """See :class:`BackwardPass`; ``running`` has the costs of the steps."""

@@ -22,12 +22,10 @@ from varpin.mechanics.scene import Scene
 from varpin.signals.commands import (
     contiguous,
     control_of,
-    ends_of,
-    first_of,
     in_parts_of_steps,
+    lines,
     open_loop,
     prescribing,
-    rest_of_line,
     rows,
     steps_of,
     with_ends,
@@ -264,31 +262,43 @@ class Compiled(Integrator):
         if scene.noise.diffusion is not None:
             return super().rollout(scene, state, commands, increments, dt)
         segments: list[Segment] = []
-        for j in range(steps_of(commands)):
-            row = rows(commands, j // commands.hold, j // commands.hold + 1, segments[-1].u[None, -1] if j else None)
-            if (taken := j % commands.hold) > 0:
-                row = open_loop(segments[-1].u)._replace(hold=commands.hold - taken)
-                if len(commands.stage_times):
-                    first = segments[j - taken - 1].u if j > taken else commands.before[:1]
-                    row = rest_of_line(row, first, taken, commands)
-            segments.append(self._step_in_python(scene, state, row, increments[:, j : j + 1], dt))
-            if segments[-1].failure is not None:
-                break
+        hold, before = commands.hold, commands.before
+        for j in range(steps_of(commands) // hold):
+            q, p, v = self.state_of(state)
+            decided = control_of(commands, j, np.concatenate([q, p if self.variational else v]), before)
+            row = rows(commands, j, j + 1, before)
+            now, begins, ends = self._controls(scene, row, np.tile(decided, (hold, 1)), q, v, dt)
+            for k in range(hold):
+                drawn = increments[0, j * hold + k] if len(increments) else None
+                around = begins[k : k + 1], ends[k : k + 1]
+                segments.append(self._step_in_python(scene, state, rows(now, k, k + 1), around, drawn, dt))
+                segments[-1].u[:] = decided
+                if segments[-1].failure is not None:
+                    return [join(segments)]
+            before = decided[None]
         return [join(segments)]
 
-    def _step_in_python(self, scene: Scene, state: Run, command: Commands, increment: Floats, dt: float) -> Segment:
-        """One step of one path with diffusion fields that are evaluated in Python."""
-        q, p, v = self.state_of(state)
-        decided = control_of(command, 0, np.concatenate([q, p if self.variational else v]), command.before)
-        now, ends, start = first_of(command, decided, self.stage_times), ends_of(command, decided), state.start[0]
+    def _controls(
+        self, scene: Scene, row: Commands, decided: Floats, q: Floats, v: Floats, dt: float
+    ) -> tuple[Commands, Floats, Floats]:
+        """The steps of a decision (hold, m) at a state, and controls (hold, m) at begins and ends of steps."""
+        now, begins, ends = open_loop(decided)._replace(within=row.within), decided, decided
+        if len(row.stage_times):
+            mean, stages, nodes = lines(row, decided, self.stage_times)
+            now = open_loop(mean) if not stages.size else open_loop(mean)._replace(within=np.ascontiguousarray(stages))
+            begins, ends = nodes[:-1], nodes[1:]
         if scene.inputs:
-            after = in_parts_of_steps(scene, decided[None], q[None], v[None], dt * command.hold, command.hold)[:1]
-            now, ends = (
-                prescribing(scene, now, after),
-                (with_ends(scene, ends[0], after), with_ends(scene, ends[1], after)),
-            )
+            after = in_parts_of_steps(scene, decided[:1], q[None], v[None], dt * row.hold, row.hold)
+            now, begins, ends = prescribing(scene, now, after), *(with_ends(scene, u, after) for u in (begins, ends))
+        return now, begins, ends
+
+    def _step_in_python(
+        self, scene: Scene, state: Run, now: Commands, ends: tuple[Floats, Floats], drawn: Floats | None, dt: float
+    ) -> Segment:
+        """One step of one path with fields in Python, between controls ``ends`` (1, m), with increments ``drawn``."""
+        q, _, v = self.state_of(state)
+        start = state.start[0]
         F, drift = diffusion_and_drift(scene, q, v, now.u[0], start, ends)
-        drawn = increment[0, 0] if len(increment) else None
         impulse = None if drawn is None else noise_of_step(scene, F, q, v, ends, start, drawn)
         segment = self.kicked(scene, state, now, self.drift_share * drift, impulse, dt)
         if drawn is not None and self.left < 1.0 and segment.failure is None:
@@ -296,7 +306,6 @@ class Compiled(Integrator):
             F, _ = diffusion_and_drift(scene, q, v, now.u[0], start)
             state.paths.kick((1.0 - self.left) * noise_of_step(scene, F, q, v, ends, start, drawn)[None])
             _, segment.p[-1:], segment.v[-1:], segment.energy[-1:] = state.paths.nodes()
-        segment.u[:] = decided
         return segment
 
     def rollout_compiled(
@@ -382,7 +391,7 @@ def diffusion_and_drift(
 def noise_of_step(
     scene: Scene, F: Floats, q: Floats, v: Floats, ends: tuple[Floats, Floats], start: Floats, dw: Floats
 ) -> Floats:
-    """The impulse (n,) of increments dw (K,) at a state, by fields in Python, F (n, k) of the mean control.
+    """The impulse (n,) of increments dw (K,) at a state, by fields in Python: F (n, k) of the mean.
 
     ``ends`` (1, m) are the controls at both ends of the step, ``start`` (n,) is the first configuration of the motion.
     """

@@ -500,9 +500,7 @@ class Scene(Frozen):
     @cached_property
     def diffusion(self) -> Diffusion:
         """The noise fields that the core can evaluate; empty if some need Python."""
-        n, m = self.actuation.shape
-        nothing = Diffusion(np.zeros((n, 0)), np.zeros((n, 0, m)), np.zeros((n, 0)), np.zeros((n, 0)))
-        return self.noise.diffusion or nothing
+        return self.noise.diffusion or bind((), self.actuation, ()).arrays
 
     @cached_property
     def values(self) -> Mapping[str, Floats]:

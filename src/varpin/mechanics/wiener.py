@@ -5,6 +5,7 @@ Those that are refined or summed are of the processes themselves: the first k co
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 
@@ -91,9 +92,7 @@ def children(rng: np.random.Generator | int, number: int) -> Children:
     seed = parent.seed_seq
     if not isinstance(seed, np.random.SeedSequence):
         raise InputError(f"rng must be seeded by a numpy SeedSequence, to have a child for each path; got {seed!r}")
-    before = np.random.SeedSequence(
-        seed.entropy, spawn_key=seed.spawn_key, pool_size=seed.pool_size, n_children_spawned=seed.n_children_spawned
-    )
+    before = copy.copy(seed)
     if isinstance(rng, np.random.Generator):
         for first in range(0, number, _BATCH):
             seed.spawn(min(_BATCH, number - first))

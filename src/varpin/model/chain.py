@@ -38,14 +38,9 @@ def rod_chain(
     armature: float = 0.0,
     rail: float | None = None,
 ) -> Robot:
-    """A chain like :func:`planar_chain` of unequal rods, some of them without length or mass.
+    """A chain like :func:`planar_chain` of rods of these lengths [m] and masses [kg], >= 0, from ``base`` (3,) [m] on.
 
-    Args:
-        lengths: Lengths of the links [m], >= 0.
-        masses: Masses of the links [kg], >= 0.
-        base: Position of the first joint (3,) [m].
-        armature: Armature of every joint [kg m^2 or kg].
-        rail: Mass of a carriage that slides along x and carries the first joint [kg]; no carriage if left out.
+    Every joint has an ``armature`` [kg m^2 or kg]; a carriage of mass ``rail`` [kg] slides along x and carries them.
     """
     links = count("number of lengths", len(lengths), 1)
     sizes, weights = finite_array("lengths", lengths, (links,)), finite_array("masses", masses, (links,))

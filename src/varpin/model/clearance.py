@@ -322,16 +322,10 @@ def clearance(
     srdf: Path | None = None,
     capsules: Mapping[str, tuple[ArrayLike, ArrayLike, float]] | None = None,
 ) -> Clearance:
-    """Distances of a robot's links, each in a capsule, to obstacles and to each other.
+    """Distances of a robot's links, each in a capsule, to obstacles and to each other; see :class:`varpin.KeepClear`.
 
-    Args:
-        robot: The robot.
-        obstacles: Obstacles, each paired with every moving link.
-        links: Which links; if left out, all that have shapes or a given capsule.
-        itself: Also pair links with each other, except neighbours: links on the same joint or on successive joints, and
-            links that overlap at q = 0.
-        srdf: A file whose ``disable_collisions`` elements exclude pairs of links.
-        capsules: (begin, end, radius) in a link's own axes [m], instead of the capsule fitted around its shapes.
+    ``itself`` pairs links with each other, except neighbours (links on the same joint or on successive joints), links
+    that overlap at q = 0, and the pairs of ``disable_collisions`` in an ``srdf`` file.
     """
     if capsules is not None and not isinstance(capsules, Mapping):
         raise InputError(f"capsules must be a dictionary, link: (begin, end, radius), got {type(capsules).__name__}")

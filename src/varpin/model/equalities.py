@@ -5,7 +5,6 @@ A tree does not keep them. :mod:`varpin.mechanics.description` makes constraints
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -30,39 +29,22 @@ class Plane(NamedTuple):
     tilt: float  # greatest angle of a joint's axis with the normal, or of a slide's with the plane [rad]
 
 
-@dataclass(frozen=True, eq=False)
-class Closure:
-    """Two frames that coincide (``<weld>``), or their origins alone (``<connect>``).
+class Closure(NamedTuple):
+    """Two frames that coincide (``<weld>``), or their origins alone (``<connect>``)."""
 
-    Attributes:
-        name: Tag and name of the element.
-        a: Frame on the first body.
-        b: Frame on the second body.
-        turns: Whether the axes of the frames coincide, too.
-        plane: Of a planar loop whose numbers are rounded; its point coincides in this plane only.
-    """
-
-    name: str
+    name: str  # tag and name of the element
     a: End
     b: End
-    turns: bool
-    plane: Plane | None = None
+    turns: bool  # whether the axes of the frames coincide, too
+    plane: Plane | None = None  # of a planar loop whose numbers are rounded; its point coincides in this plane only
 
 
-@dataclass(frozen=True)
-class Gear:
-    """A joint that follows another: q_joint = c_0 + c_1 q_leader + c_2 q_leader^2 + ... (``<joint>``).
+class Gear(NamedTuple):
+    """A joint that follows another: q_joint = c_0 + c_1 q_leader + c_2 q_leader^2 + ... (``<joint>``)."""
 
-    Attributes:
-        name: Tag and name of the element.
-        joint: Name of the following joint.
-        leader: Name of the leading joint; None if the joint is held at c_0.
-        coefficients: c.
-    """
-
-    name: str
+    name: str  # tag and name of the element
     joint: str
-    leader: str | None
+    leader: str | None  # None if the joint is held at c_0
     coefficients: tuple[float, ...]
 
 
@@ -70,14 +52,10 @@ Equality: TypeAlias = Closure | Gear
 
 
 def rounded_plane(model: pin.Model, a: tuple[int, pin.SE3], b: tuple[int, pin.SE3]) -> Plane | None:
-    """The plane of a loop, if it is planar up to the rounding of a file's numbers.
+    """The plane of a loop, if it is planar up to the rounding of a file's numbers; of the model's ``"qpos0"``.
 
-    None for loops in space, and for those that are planar to the last digit.
-
-    Args:
-        model: A model with the reference configuration ``"qpos0"``.
-        a: A joint, and the placement in its axes where the loop is closed.
-        b: The same on the other side.
+    None for loops in space, and for those that are planar to the last digit. The loop is closed at two placements, each
+    in the axes of a joint.
     """
     sides = [set(model.supports[joint]) for joint, _ in (a, b)]
     loop = sorted(sides[0] ^ sides[1])
@@ -106,6 +84,6 @@ def prefixed(equality: Equality, prefix: str) -> Equality:
     """The equality of a robot whose joints and frames have a prefix."""
     if isinstance(equality, Closure):
         a, b = (end._replace(body=prefix + end.body) for end in (equality.a, equality.b))
-        return replace(equality, a=a, b=b)
+        return equality._replace(a=a, b=b)
     leader = None if equality.leader is None else prefix + equality.leader
-    return replace(equality, joint=prefix + equality.joint, leader=leader)
+    return equality._replace(joint=prefix + equality.joint, leader=leader)

@@ -85,12 +85,9 @@ Reader = Callable[[str], tuple[MeshPart, ...]]
 
 
 def read_mesh(path: str) -> tuple[MeshPart, ...]:
-    """Read a mesh file: Collada, Wavefront (.obj), STL, PLY, OFF or glTF.
+    """Read a mesh file, Collada, Wavefront (.obj), STL, PLY, OFF or glTF: at least one part for each material [m].
 
     Lengths of a Collada file are in its unit; its ``<up_axis>`` is ignored, as RViz, MoveIt and Gazebo do.
-
-    Returns:
-        Its parts, in metres: at least one for each material.
     """
     file = Path(path)
     if not is_file(file):

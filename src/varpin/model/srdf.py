@@ -61,8 +61,6 @@ def read_srdf(path: Path, text: str | None = None) -> tuple[tuple[Posture, ...],
     for joint in root.iterfind("rotor_params/joint"):
         where = f"of the rotor of joint {joint.get('name')!r}"
         mass = finite_number(joint.get("mass", "0"), f"{path}: mass {where}")
-        if mass < 0.0:
-            raise RobotError(f"{path}: mass {where} is negative: {mass:g}")
         ratio = finite_number(joint.get("gear_ratio", "0"), f"{path}: gear_ratio {where}")
         armature[joint.get("name", "")] = mass * ratio**2
     return tuple(postures), armature

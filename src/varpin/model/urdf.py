@@ -109,13 +109,9 @@ class Urdf:
 
 
 def read_urdf(path: Path, text: str | None = None) -> Urdf:
-    """Read a URDF file.
+    """Read a URDF file, or its text if that is another one.
 
     XML is read as leniently as Pinocchio reads it: prefixes need no namespace, and comments may contain ``--``.
-
-    Args:
-        path: Path of the file.
-        text: The URDF text, if not the file's content.
     """
     root = read_xml(path, text)
     parent: dict[str, str] = {}

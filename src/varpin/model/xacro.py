@@ -59,19 +59,16 @@ def expand(
     *,
     strict: bool = True,
 ) -> str:
-    """The XML to which a xacro file expands.
+    """The XML to which a xacro file expands, with its arguments by name: strings, numbers or booleans.
 
-    Args:
-        path: Path of the file.
-        arguments: Its arguments by name: strings, numbers or booleans.
-        package_dirs: Folders in which ``$(find package)`` is looked up, after those that contain the file.
-        packages: Known folders of packages by name.
-        strict: Whether an argument that the file does not use is an error.
+    ``$(find package)`` is looked up in ``packages``, folders by name, around the file, and in ``package_dirs``. If
+    ``strict``, an argument that the file does not use is an error.
     """
     xacro, substitution = _package(path)
     if path.read_bytes().startswith(LFS_POINTER):
         raise RobotError(f"{path} is a Git LFS pointer, not the file itself: git lfs pull downloads it")
-    given = _Arguments({name: _word(value) for name, value in arguments.items()})
+    words = {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in arguments.items()}
+    given = _Arguments(words)
     notes = io.StringIO()
     with _LOCK, contextlib.redirect_stderr(notes), _finding(substitution, path, package_dirs, packages or {}):
         try:
@@ -107,10 +104,6 @@ def _told(error: Exception) -> str:
     if isinstance(error, expat.ExpatError):
         return f"it is not well-formed XML: {error}"
     return " ".join(re.sub(r"<class '[^']*'>:?|^.*\[Errno \d+\]", "", str(error)).split()) or type(error).__name__
-
-
-def _word(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 @contextlib.contextmanager

@@ -165,45 +165,32 @@ def plot_energy_error(
     return figure, axes
 
 
-def plot_trajectory(
-    trajectory: Motion, axes: Sequence[Axes] | NDArray[Any] | None = None, *, robot: Robot | None = None
-) -> tuple[Figure | SubFigure, NDArray[Any]]:
+def plot_trajectory(trajectory: Motion, *, robot: Robot | None = None) -> tuple[Figure, NDArray[Any]]:
     """An overview: positions, velocities, controls and energy, one above the other.
 
     Args:
         trajectory: The motion, or a plan or a controller's run that has one.
-        axes: Four axes to draw on; a new figure if left out, without the panel of controls if there are none or all
-            are 0.
         robot: As for :func:`plot_joints`.
 
     Returns:
-        The figure and its axes: four, or three without controls.
+        The figure and its axes: four, or three where there are no controls or all are 0.
 
     Raises:
-        InputError: ``axes`` are not four, or as for the single figures.
+        InputError: As for the single figures.
     """
     given, trajectory = trajectory, _require_motion(trajectory, robot)
-    draw = [plot_joints, plot_velocities]
-    if axes is not None or np.any(trajectory.u):
-        draw.append(plot_controls)
-    if axes is not None:
-        panels = np.asarray(axes, dtype=object).ravel()
-        if panels.size != 4:
-            raise InputError(f"axes must be 4 (positions, velocities, controls, energy), got {panels.size}")
-    else:
-        new = Figure(figsize=(9.0, 2.5 * (len(draw) + 1)), layout="constrained")
-        panels = new.subplots(len(draw) + 1, 1, sharex=True)
+    draw = [plot_joints, plot_velocities, *([plot_controls] if np.any(trajectory.u) else [])]
+    figure = Figure(figsize=(9.0, 2.5 * (len(draw) + 1)), layout="constrained")
+    panels = figure.subplots(len(draw) + 1, 1, sharex=True)
     for plot, panel in zip(draw, panels, strict=False):
         plot(given, panel, robot=robot)
         panel.set_xlabel("")
     plot_energy_error(trajectory, panels[-1])
-    if axes is None:
-        off = f", {trajectory.error_text} rad or m" if trajectory.error_text else ""
-        title = f"{trajectory.robot}: {trajectory.integrator}, dt = {trajectory.dt:g} s{off}"
-        new.suptitle(title, fontsize="large")
-        _share_legend(new, panels[: len(draw)])
-        new.align_ylabels()
-    return panels[0].figure, panels
+    off = f", {trajectory.error_text} rad or m" if trajectory.error_text else ""
+    figure.suptitle(f"{trajectory.robot}: {trajectory.integrator}, dt = {trajectory.dt:g} s{off}", fontsize="large")
+    _share_legend(figure, panels[: len(draw)])
+    figure.align_ylabels()
+    return figure, panels
 
 
 def _share_legend(figure: Figure, panels: NDArray[Any]) -> None:

@@ -77,20 +77,6 @@ def on_lines(begins: Floats, ends: Floats, hold: int, times: Sequence[float]) ->
     return found
 
 
-def rest_of_line(end: Commands, first: Floats, taken: int, commands: Commands) -> Commands:
-    """The line from ``first`` (1, m) to ``end`` over the steps of a decision, after ``taken`` steps."""
-    here = first + taken / commands.hold * (end.u - first)
-    return end._replace(before=here, hold=commands.hold - taken, stage_times=commands.stage_times)
-
-
-def first_of(command: Commands, control: Floats, times: Sequence[float]) -> Commands:
-    """The first step under a decision's ``control`` (m,): its mean, and the values at the stages if they change."""
-    if not len(command.stage_times):
-        return open_loop(control[None])._replace(within=command.within)
-    mean, stages, _ = lines(command, control[None], times)
-    return open_loop(mean) if not stages.size else open_loop(mean)._replace(within=np.ascontiguousarray(stages))
-
-
 def control_of(commands: Commands, decision: int, x: Floats, before: Floats) -> Floats:
     """The control (m,) of a decision at a state x (2n,), by the formula of the core.
 
@@ -104,14 +90,6 @@ def control_of(commands: Commands, decision: int, x: Floats, before: Floats) -> 
             u = u + gains[:, x.size :] @ (before[0] - commands.reference[decision, x.size :])
     limited: Floats = np.clip(u, *commands.limits)
     return limited
-
-
-def ends_of(command: Commands, decided: Floats) -> tuple[Floats, Floats]:
-    """The controls (1, m) at both ends of the first step under a decision's control (m,)."""
-    if not len(command.stage_times):
-        return decided[None], decided[None]
-    nodes = lines(command, decided[None], ()).nodes
-    return nodes[:1], nodes[1:]
 
 
 def contiguous(commands: Commands) -> Commands:

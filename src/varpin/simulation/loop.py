@@ -18,13 +18,15 @@ import scipy
 from varpin.arrays import Floats
 from varpin.errors import AssemblyError, LinearizationError, SingularMassMatrix
 from varpin.finding import Finding
+from varpin.integrators.explicit import accelerations
 from varpin.mechanics.assembly import nearest
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.simulation.law import NOTHING, Law, decisions, law_of
-from varpin.simulation.spectrum import first_order, linearized
 from varpin.trajectory import Trajectory
 
+# Rank tolerance of the constraints in the metric of the kinetic energy, relative to the largest singular value.
+_RANK = 1e-9
 # Least growth a period: rounding of fitted gains may split double eigenvalues by 3e-6. 0 to 1e-5: the same.
 _GROWTH = 1e-5
 # The period causes growth if its exponent exceeds that in continuous time by this factor: 1.1 to 3 give the same.
@@ -164,12 +166,36 @@ def _linearized(scene: Scene, law: Law, q: Floats) -> tuple[Loop, float, Floats]
     n = len(q)
     jet, (Kq, Kv, S) = lagrangian_jet(scene, q, np.zeros(n)), np.split(law.K, 3, axis=1)
     force = scene.actuation @ (Kq @ q + S @ jet.Lq + law.c)
-    a, aq, av, af, Z, onto = (part[0] for part in linearized(scene, q[None], np.zeros((1, n)), force[None]))
+    a, aq, av, af, Z, onto = _at_rest(scene, q, force)
     pushed = af @ scene.actuation
-    A, B = first_order(aq[None], av[None])[0], np.concatenate([np.zeros_like(pushed), pushed])
+    A = np.block([[np.zeros_like(aq), np.eye(len(aq))], [aq, av]])
+    B = np.concatenate([np.zeros_like(pushed), pushed])
     gains = np.concatenate([(Kq + S @ jet.Lqq) @ Z, Kv @ Z], axis=1)
     way = Z @ np.linalg.lstsq(aq + pushed @ gains[:, : len(a)], -a, rcond=None)[0]
     terms = np.abs(pushed) @ (np.abs(Kq) @ np.abs(q) + np.abs(law.c)) + np.abs(af) @ np.abs(jet.Lq)
     off = float(np.abs(a).max(initial=0.0) / max(terms.max(initial=0.0), 1e-300))
     known, sizes, _ = np.linalg.svd(np.concatenate([onto @ part for part in np.split(law.directions, 2)]), False)
     return Loop(A, B, gains, known[:, sizes > NOTHING * sizes.max(initial=0.0)]), off, way
+
+
+def _at_rest(scene: Scene, q: Floats, force: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+    """The motion linearized at rest at q (n,) under a constant force (n,), in f coordinates y of its tangent space.
+
+    Accelerations of y (f,), their derivatives in y (f, f), in its rate (f, f) and in a force (f, n), and dq = Z dy,
+    dy' = onto dv, with Z'MZ = 1 and C Z = 0. The constraint forces C' lam are constant to first order in y, but for
+    their curvature lam . g_qq.
+    """
+    still = np.zeros((1, len(q)))
+    a, aq, av, af = (part[0] for part in accelerations(scene, q[None], still, force[None]))
+    if not scene.constraints:
+        return a, aq, av, af, np.eye(len(q)), np.eye(len(q))
+    C = scene.core.constraints(np.ascontiguousarray(q[None]))[2][0]
+    root = np.linalg.cholesky(af)
+    left, sizes, right = np.linalg.svd(C @ root)
+    rank = int((sizes > _RANK * sizes.max(initial=0.0)).sum())
+    left, sizes, Z = left[:, :rank], sizes[:rank], root @ right[rank:].T
+    lam = -left @ ((left.T @ C @ a) / sizes**2)
+    a, aq, av, af = (part[0] for part in accelerations(scene, q[None], still, (force + C.T @ lam)[None]))
+    onto = Z.T @ np.linalg.inv(af)
+    curved = scene.core.constraint_curvature(q, lam, q)[0]
+    return onto @ a, onto @ (aq + af @ curved) @ Z, onto @ av @ Z, onto @ af, Z, onto

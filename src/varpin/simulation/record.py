@@ -160,7 +160,7 @@ def trajectory_of(
     within: Floats | None,
     on: Commands | None = None,
 ) -> Trajectory:
-    """The motion from a first node through consecutive segments; increments ``dw`` (N, k), None for zeros.
+    """The motion from a first node through consecutive segments, with increments ``dw`` (N, k), None for zeros.
 
     ``within`` are the controls at the stages (N, s, m), None for constant ones; ``on`` the commands of the whole
     motion, where its controls are linear between nodes.
@@ -287,7 +287,7 @@ class Motions:
         increments: Floats | None = None,
         integrator: Integrator | None = None,
     ) -> tuple[Trajectory, Failure | None]:
-        """The motion under commands of all its steps, unchecked, and the failure that stopped it early, if any.
+        """The motion under commands of all its steps, unchecked, and the failure that stopped it, if any.
 
         ``increments`` are (N, k) [s^0.5], left out for no noise; ``integrator`` is the integrator with another guard.
         Raises a ForceError or ConstraintError if a function failed.

@@ -1,27 +1,17 @@
-"""How fast and how far: modes of a scene, what is damped faster than a step, travels and speeds of a motion.
-
-A motion linearized at one of its states: d/dt (dq, dv) = (dv, aq dq + av dv). Under constraints dq = Z y on the tangent
-space, with Z'MZ = 1 and C Z = 0, and y follows the same equation: the constraint forces C' lam are constant to first
-order in it, but for their curvature lam . g_qq.
-"""
+"""How fast and how far: modes of a scene, what is damped faster than a step, travels and speeds of a motion."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from varpin.arrays import Floats, Integers
-from varpin.errors import LinearizationError
-from varpin.integrators.explicit import accelerations
+from varpin.arrays import Floats
 from varpin.mechanics.forces import dissipates, limited_servos, of_kind
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.model import longest_reach
 
-# Rank tolerance of the constraints in the metric of the kinetic energy, relative to the largest singular value.
-_RANK = 1e-9
 # Nodes at which rates along a motion are looked for, beside those where joints are slowest or in their stops.
 _NODES = 12
 # Accumulated rounding, relative to positions.
@@ -33,81 +23,6 @@ _SHORTEST = 1e-8
 _LITTLE, _SLOW = 1e-2, 5e-2
 # Rates below count as zero [1/s].
 _SLOWEST = 1e-6
-
-
-class Linearized(NamedTuple):
-    """Motions linearized at K states, in f coordinates y of their tangent spaces, with dq = Z y; y = q without any."""
-
-    a: Floats  # accelerations of y (K, f)
-    aq: Floats  # their derivatives in y (K, f, f)
-    av: Floats  # in the rate of y (K, f, f)
-    af: Floats  # in a force (K, f, n)
-    Z: Floats  # (K, n, f)
-    onto: Floats  # the rate of y is onto @ v (K, f, n)
-
-
-def linearized(scene: Scene, q: Floats, v: Floats, forces: Floats, accelerated: Floats | None = None) -> Linearized:
-    """Linearize the motions at states q, v (K, n) on the constraints, under constant forces (K, n).
-
-    ``accelerated`` (K, n) are the accelerations of joints with kinematic inputs, zero if left out. Raises a
-    LinearizationError where a mass matrix is not positive definite, or a matrix of the constraints not finite.
-    """
-    a, aq, av, af = accelerations(scene, q, v, forces)
-    if not scene.constraints:
-        unit = np.broadcast_to(np.eye(q.shape[1]), aq.shape)
-        return Linearized(a, aq, av, af, unit, unit)
-    C = scene.core.constraints(np.ascontiguousarray(q))[2]
-    try:
-        at = [
-            _onto_constraints(scene, q[k], v[k], C[k], a[k], af[k], None if accelerated is None else accelerated[k])
-            for k in range(len(q))
-        ]
-    except np.linalg.LinAlgError:
-        raise LinearizationError(0, 0.0, "the constraints cannot be linearized") from None
-    if len({each.Z.shape for each in at}) > 1:
-        raise LinearizationError(0, 0.0, "the constraints have another rank at each node")
-    lam = np.array([each.lam for each in at])
-    a, aq, av, af = accelerations(scene, q, v, forces + np.einsum("kri,kr->ki", C, lam))
-    Z = np.array([each.Z for each in at])
-    M = np.linalg.inv(af)
-    onto = np.swapaxes(Z, 1, 2) @ M
-    curved = np.array([scene.core.constraint_curvature(x, y, x)[0] for x, y in zip(q, lam, strict=True)])
-    # A velocity stays on the constraints: its part across them changes with y.
-    turned = -np.array([each.across @ each.bend for each in at]) @ Z
-    by_place = onto @ (aq + af @ curved) @ Z + onto @ av @ turned
-    return Linearized((onto @ a[:, :, None])[:, :, 0], by_place, onto @ av @ Z, onto @ af, Z, onto)
-
-
-def first_order(aq: Floats, av: Floats) -> Floats:
-    """Matrices (K, 2n, 2n) of the linearized motion from derivatives of the accelerations (K, n, n)."""
-    n = aq.shape[-1]
-    A = np.zeros((len(aq), 2 * n, 2 * n))
-    A[:, range(n), range(n, 2 * n)] = 1.0
-    A[:, n:, :n], A[:, n:, n:] = aq, av
-    return A
-
-
-class _Node(NamedTuple):
-    lam: Floats  # the constraint forces (c,)
-    Z: Floats  # (n, f)
-    across: Floats  # the velocity (n, c) across the tangent space for a velocity of each row
-    bend: Floats  # g_qq v (c, n)
-
-
-def _onto_constraints(
-    scene: Scene, q: Floats, v: Floats, C: Floats, a: Floats, af: Floats, accelerated: Floats | None
-) -> _Node:
-    """The tangent space at a state, and the constraint forces beside the accelerations a (n,) without them."""
-    root = np.linalg.cholesky(af)
-    left, sizes, right = np.linalg.svd(C @ root)
-    rank = int((sizes > _RANK * sizes.max(initial=0.0)).sum())
-    left, sizes = left[:, :rank], sizes[:rank]
-    bend = scene.core.constraint_curvature(q, np.zeros(len(C)), v)[1]
-    wanted = -bend @ v
-    for row, c in scene.inputs.items():
-        wanted[row] = 0.0 if accelerated is None else accelerated[c]
-    lam = left @ ((left.T @ (wanted - C @ a)) / sizes**2)
-    return _Node(lam, root @ right[rank:].T, root @ (right[:rank].T / sizes) @ left.T, bend)
 
 
 def masses(scene: Scene, q: Floats) -> Floats:
@@ -183,18 +98,17 @@ def fastest_rate(scene: Scene, q: Floats, v: Floats, u: Floats, least: float) ->
     """
     if not scene.dissipates or not len(u):
         return 0.0
-    at = np.unique(np.linspace(0, len(u), _NODES).astype(np.int64))
-    states = [(q[at], v[at], at)]
-    for friction in of_kind(scene.elements, "CoulombFriction"):
-        c = friction.coordinate
-        node = np.array([int(np.abs(v[:, c]).argmin())])
-        still = v[node]
+    slowest = [
+        (own.coordinate, int(np.abs(v[:, own.coordinate]).argmin()))
+        for own in of_kind(scene.elements, "CoulombFriction")
+    ]
+    even = np.linspace(0, len(u), _NODES).astype(np.int64)
+    at = np.array([*even, *_deepest(scene, q), *(node for _, node in slowest)])
+    speeds = v[at]
+    for row, (c, _) in enumerate(slowest, len(at) - len(slowest)):
         if v[:, c].min() < 0.0 < v[:, c].max():
-            still[:, c] = 0.0
-        states.append((q[node], still, node))
-    states += _in_stops(scene, q, v)
-    q, v, at = (np.concatenate(rows) for rows in zip(*states, strict=True))
-    return fastest_damping(scene, q, v, u[np.minimum(at, len(u) - 1)] @ scene.actuation.T, least)
+            speeds[row, c] = 0.0
+    return fastest_damping(scene, q[at], speeds, u[np.minimum(at, len(u) - 1)] @ scene.actuation.T, least)
 
 
 def contact_rate(scene: Scene, q: Floats, v: Floats, dt: float) -> float:
@@ -202,10 +116,11 @@ def contact_rate(scene: Scene, q: Floats, v: Floats, dt: float) -> float:
 
     ``q`` and ``v`` are the nodes of a motion (N + 1, n) in steps of ``dt`` [s], within which a joint may come and go.
     """
-    states = _in_stops(scene, np.concatenate([q, q + dt * v]), np.concatenate([v, v]))
-    if not states:
+    q, v = np.concatenate([q, q + dt * v]), np.concatenate([v, v])
+    at = _deepest(scene, q)
+    if not at:
         return 0.0
-    q, v, _ = (np.concatenate(rows) for rows in zip(*states, strict=True))
+    q, v = q[at], v[at]
     # Springs of stops are in the potential, their dampers among the forces.
     jets = [lagrangian_jet(scene, place, np.zeros_like(place)) for place in q]
     eased = np.array([np.diag(np.linalg.inv(jet.Lvv)) for jet in jets])
@@ -214,16 +129,10 @@ def contact_rate(scene: Scene, q: Floats, v: Floats, dt: float) -> float:
     return float(np.maximum(np.sqrt(np.maximum(-by_q * eased, 0.0)), -by_v * eased).max())
 
 
-def _in_stops(scene: Scene, q: Floats, v: Floats) -> list[tuple[Floats, Floats, Integers]]:
-    """States (1, n), (1, n) and nodes (1,) of a motion where joints are deepest in each stop, at full stiffness."""
-    states = []
-    for c, end, side, width in _ends(scene):
-        deepest = int((side * q[:, c]).argmax())
-        if (depth := side * (q[deepest, c] - end)) > 0.0:
-            pressed = q[deepest][None].copy()
-            pressed[0, c] = end + side * max(depth, width)
-            states.append((pressed, v[deepest][None], np.array([deepest])))
-    return states
+def _deepest(scene: Scene, q: Floats) -> list[int]:
+    """The nodes of q (K, n) at which joints are deepest in each stop that they reach."""
+    deepest = [(c, end, side, int((side * q[:, c]).argmax())) for c, end, side, _ in _ends(scene)]
+    return [node for c, end, side, node in deepest if side * (q[node, c] - end) > 0.0]
 
 
 def _ends(scene: Scene) -> list[tuple[int, float, float, float]]:

@@ -132,18 +132,10 @@ def exact_motion(
 def path(
     scene: Scene, x: Floats, u: Floats, dw: Floats, *, dt: float, left: float | None, origin: Floats, end: float
 ) -> Floats:
-    """States (K + 1, 2n) of the exact motion, the first itself, as far as it can be integrated.
+    """States (K + 1, 2n) of the exact motion from x = (q, v), until a processor time [s].
 
-    Args:
-        scene: The scene.
-        x: q and v at first (2n,).
-        u: Controls of each step (N, m).
-        dw: Increments of the Wiener processes (N, k).
-        dt: Time step [s].
-        left: Part of each kick that comes before its step; the rest comes after it. None for a constant force over the
-            step instead.
-        origin: Configuration that diffusion fields are relative to (n,).
-        end: Processor time at which it ends [s].
+    Of each step's kick the part ``left`` comes before it and the rest after it; None holds the kick over the step.
+    Diffusion fields are relative to ``origin`` (n,).
     """
     dynamics, noisy, states = ForwardDynamics(scene.core), bool(dw.any()), x[None]
     # The first of the steps that each control is held for.

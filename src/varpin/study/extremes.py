@@ -162,19 +162,9 @@ class Record(Study[Cell]):
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A motion that is hard to integrate.
+    """A motion that is hard to integrate, with controls (N, m) and increments (N, k) [s^0.5] or None.
 
-    Attributes:
-        name: Unique among a robot's.
-        dt: Time step [s].
-        steps: N.
-        scene: The scene.
-        q0: (n,) [rad or m].
-        v0: (n,) [rad/s or m/s].
-        controls: None, or a row for each step (N, m).
-        increments: Of the Wiener processes (N, k) [s^0.5], or None.
-        ahead: Whole turns in q0 that the motion does not depend on (n,) [rad].
-        window: Duration of the comparison with the exact motion [s].
+    It does not depend on the whole turns in q0 that it is ``ahead`` (n,) [rad]; a window [s] of it is compared.
     """
 
     name: str

@@ -1,16 +1,6 @@
 // The backward pass of stochastic differential dynamic programming (Theodorou, Tassa and Todorov 2010).
-// docs/mathematics.md, "The backward pass" and "Digits".
-//
-// The value after a step is v0 + Wx . x' + Wu . u + (1/2) (x', u) W (x', u), in deviations from the nominal trajectory;
-// it depends on u only while a control is held over several steps. With x' = A x + B u + sum_i (g_i + Gx_i x + Gu_i u)
-// dw_i, the running cost l expanded in z = (x, u) at the start of the step, and S = h Wxx,
-//
-//     Q_x  = h l_x + A'Wx + sum_i Gx_i' S g_i,          Q_xx = h l_xx + A'Wxx A + sum_i Gx_i' S Gx_i,
-//     k    = -Q_uu^-1 Q_u,    K = -Q_uu^-1 Q_ux,        V_xx = Q_xx + K'(Q_uu K + Q_ux) + Q_ux'K,
-//
-// and likewise in u; v0 grows by (1/2) sum_i g_i' S g_i.
-//
-// Equation (O2) of docs/mathematics.md.
+// docs/mathematics.md, "The backward pass" and "Digits"; equation (O2). The value after a step depends on the control u
+// only while it is held over several steps. S = h Wxx weighs the jumps of noise.
 #pragma once
 
 #include <algorithm>
@@ -19,7 +9,6 @@
 #include <vector>
 
 #include "varpin/dense.hpp"
-#include "varpin/linear_step.hpp"
 #include "varpin/simd.hpp"
 #include "varpin/steps.hpp"
 
@@ -41,7 +30,7 @@ class BackwardPass {
     // A pass over a block of steps, with each control held over `hold` of them; blocks follow each other from the last
     // to the first. Returns -1, or the decision without a minimum.
     std::ptrdiff_t run(double h, int hold, double regularization, const ExpandedSteps& steps, const Gains& gains) {
-#if defined(__x86_64__) && defined(__GNUC__)
+#if defined(__x86_64__)
         if (has_avx2()) return run_avx2(h, hold, regularization, steps, gains);
 #endif
         return run_steps(h, hold, regularization, steps, gains);
@@ -53,7 +42,7 @@ class BackwardPass {
     Found found;
 
   private:
-#if defined(__x86_64__) && defined(__GNUC__)
+#if defined(__x86_64__)
     [[gnu::target("avx2"), gnu::flatten]] std::ptrdiff_t run_avx2(double h, int hold, double regularization,
                                                                   const ExpandedSteps& steps, const Gains& gains) {
         return run_steps(h, hold, regularization, steps, gains);

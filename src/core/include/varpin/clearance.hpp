@@ -18,8 +18,8 @@
 
 #include "varpin/dense.hpp"
 #include "varpin/dynamics.hpp"
+#include "varpin/mechanism.hpp"
 #include "varpin/policy.hpp"
-#include "varpin/tree.hpp"
 
 namespace varpin {
 

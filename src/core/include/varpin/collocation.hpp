@@ -1,16 +1,14 @@
 // The forced discrete Euler-Lagrange equations of a collocation step: their residual r (`residuals_of`), Newton's
-// matrix N (`assemble`) and iteration (`solve`). docs/mathematics.md, "Solving a step" and "Higher order";
-// step_equation.hpp has the derivatives of a step, constrained.hpp steps with constraints. The unknowns are the stage
-// velocities V_i (tableau.hpp). With F = f + the forces of elements (forces.hpp), whose derivatives F_q, F_v and F_f -
-// 1 are diagonal, and of couplings (couplings.hpp), whose F_q and F_v are full in their blocks,
+// matrix N (`assemble`) and iteration (`solve`). docs/mathematics.md, "Solving a step" and "Higher order"; equations
+// (D3), (D4), (S1), (C1) and (C3), (1.8) and (1.9) of the paper. step_equation.hpp has the derivatives of a step,
+// constrained.hpp steps with constraints. The unknowns are the stage velocities V_i (tableau.hpp). With F = f + the
+// forces of elements, whose derivatives are diagonal, and of couplings, whose F_q and F_v are full in their blocks,
 //
 //     r_i(V) = p0 + h sum_j (abar_ij L_q + f_ij F)(Q_j, V_j) - L_v(Q_i, V_i) = 0
 //     N_im = -dr_i/dV_m = delta_im M_i + h (a_im A_i - abar_im A_m' - f_im F_v,m)
 //                         - h^2 sum_j a_jm (abar_ij L_qq,j + f_ij F_q,j)
 //
-// N is block-diagonal, with one matrix for each block of the tree; elimination needs none of them. On the branch of
-// solutions that is connected to h -> 0 its determinant is positive.
-// Equations (D3), (D4), (S1), (C1) and (C3) of docs/mathematics.md; (1.8) and (1.9) of the paper.
+// N is block-diagonal, with one matrix for each block of the tree; elimination needs none of them.
 #pragma once
 
 #include <algorithm>

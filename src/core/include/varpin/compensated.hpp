@@ -1,7 +1,5 @@
-// Compensated sums, and angles without whole turns. docs/mathematics.md, "Solving a step".
-//
-// The angle of a joint after a million turns has only nine decimals in floating point. The Lagrangian is periodic in
-// such an angle, so sweeps take it within one turn. Whole turns are counted separately; the reported angle has them.
+// Compensated sums, and angles without whole turns: the Lagrangian is periodic in them, and after a million turns an
+// angle has only nine decimals. docs/mathematics.md, "Solving a step".
 #pragma once
 
 #ifdef __FAST_MATH__

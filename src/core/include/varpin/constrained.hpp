@@ -1,14 +1,11 @@
-// Variational steps under holonomic constraints g(q) = 0 (docs/constraints.md). The discrete action is
-// h sum_i b_i L(Q_i, V_i) - sum_k Lam_k . g(Q~_k), with Lobatto points Q~_k = q0 + h sum_j t_kj V_j, and t_kj the
-// integral of the j-th Lagrange polynomial on Gauss's points from 0 to the k-th Lobatto point. It gives
+// Variational steps under holonomic constraints g(q) = 0. docs/constraints.md; equations (H1) and (H2). With Lobatto
+// points Q~_k = q0 + h sum_j t_kj V_j, t_kj the integral of the j-th Lagrange polynomial on Gauss's points up to the
+// k-th point, and w_ik = 1 - t_ki / b_i,
 //
-//     L_v(Q_i, V_i) = p0 + h sum_j a_ij (L_q + F)_j - sum_{k<s} w_ik C_k' Lam_k,    w_ik = 1 - t_ki / b_i
-//     g(Q~_k) = 0 for k = 1 .. s
+//     L_v(Q_i, V_i) = p0 + h sum_j a_ij (L_q + F)_j - sum_{k<s} w_ik C_k' Lam_k,    g(Q~_k) = 0 for k = 1 .. s
 //     p1 = p0 + h sum_j b_j (L_q + F)_j - sum_{k<=s} C_k' Lam_k,    C(q1) M(q1)^-1 p1 = 0
 //
-// Newton's matrix for all (V, Lam) at once is solved with pivoting. Rows of C that depend on others, in the metric of
-// the kinetic energy at the start of a substep, are left out of it: the other rows imply them.
-// Equations (H1) and (H2) of docs/constraints.md.
+// Rows of C that depend on others, in the metric of the kinetic energy, are left out: the other rows imply them.
 #pragma once
 
 #include <algorithm>
@@ -17,7 +14,6 @@
 
 #include "varpin/constraint_basis.hpp"
 #include "varpin/guards.hpp"
-#include "varpin/kinematic_inputs.hpp"
 #include "varpin/variational.hpp"
 
 namespace varpin {

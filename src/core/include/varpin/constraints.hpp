@@ -18,22 +18,14 @@
 #include <utility>
 #include <vector>
 
-#include "varpin/body.hpp"
 #include "varpin/kinematics.hpp"
 #include "varpin/spatial.hpp"
 
 namespace varpin {
 
-// A point relative to its body's joint [m], or a direction, in body axes; in the world for body -1.
-struct CarriedVector {
-    int body = -1;
-    Vec3<double> point{};
-    bool direction = false;
-};
-
 // A vector, or the difference of two.
 struct VectorSum {
-    std::vector<CarriedVector> parts;  // one or two
+    std::vector<Anchor> parts;  // one or two
 };
 
 // factor X . Y - constant; x and y are indices into the list of vectors.
@@ -76,22 +68,17 @@ struct ConstraintJet {
     std::vector<double> at_q;    // (n)
     std::vector<double> custom;  // (n, n)
     // Work arrays of derivatives.
-    struct Lever {
-        int coordinate = 0;
-        Vec3<double> turn{};   // w_i
-        Vec3<double> shift{};  // dX/dq_i of the vector
-    };
     std::vector<Placement> at;
-    std::vector<std::vector<Lever>> levers;  // of each part of each vector, from the root on
-    std::vector<Vec3<double>> value;         // of each vector
-    std::vector<double> reach;               // of each vector
-    std::vector<Vec3<double>> slope;         // (vectors, n)
-    std::vector<double> slope_size;          // (vectors, n)
-    std::vector<Vec3<double>> moved;         // (vectors, n)
-    std::vector<Vec3<double>> weight;        // of each vector
+    std::vector<std::vector<Arm<double>>> arms;  // of each part of each vector, from the root on
+    std::vector<Vec3<double>> value;             // of each vector
+    std::vector<double> reach;                   // of each vector
+    std::vector<Vec3<double>> slope;             // (vectors, n)
+    std::vector<double> slope_size;              // (vectors, n)
+    std::vector<Vec3<double>> moved;             // (vectors, n)
+    std::vector<Vec3<double>> weight;            // of each vector
 
     auto arrays() {
-        return std::tie(g, scale, C, size, at_q, custom, at, levers, value, reach, slope, slope_size, moved, weight);
+        return std::tie(g, scale, C, size, at_q, custom, at, arms, value, reach, slope, slope_size, moved, weight);
     }
 };
 
@@ -110,7 +97,7 @@ class Constraints {
         LinkCollector collector(bodies, links_);
         for (VectorSum& sum : vectors) {
             Joined joined{std::move(sum), {}, legs_, false};
-            for (CarriedVector& part : joined.sum.parts) {
+            for (Anchor& part : joined.sum.parts) {
                 part.body = collector.take(part.body);
                 joined.moves = joined.moves || part.body >= 0;
                 joined.paths.push_back(links_.path(part.body));
@@ -195,13 +182,13 @@ class Constraints {
         for (std::size_t a = 0; a < vectors_.size(); ++a) {
             if (!vectors_[a].moves) continue;
             for (std::size_t part = 0; part < vectors_[a].sum.parts.size(); ++part) {
-                const auto& levers = w.levers[vectors_[a].first_leg + part];
-                for (std::size_t i = 0; i < levers.size(); ++i) {
-                    const Vec3<double> turned = cross(w.weight[a], levers[i].turn);
-                    for (std::size_t j = i; j < levers.size(); ++j) {
-                        const double term = dot(turned, levers[j].shift);
-                        H[levers[i].coordinate * n_ + levers[j].coordinate] += term;
-                        if (i != j) H[levers[j].coordinate * n_ + levers[i].coordinate] += term;
+                const auto& arms = w.arms[vectors_[a].first_leg + part];
+                for (std::size_t i = 0; i < arms.size(); ++i) {
+                    const Vec3<double> turned = cross(w.weight[a], arms[i].angular);
+                    for (std::size_t j = i; j < arms.size(); ++j) {
+                        const double term = dot(turned, arms[j].linear);
+                        H[arms[i].coordinate * n_ + arms[j].coordinate] += term;
+                        if (i != j) H[arms[j].coordinate * n_ + arms[i].coordinate] += term;
                     }
                 }
             }
@@ -227,15 +214,15 @@ class Constraints {
         std::fill(w.weight.begin(), w.weight.end(), Vec3<double>{});
         for (std::size_t a = 0; a < vectors_.size(); ++a) {
             for (std::size_t part = 0; part < vectors_[a].sum.parts.size(); ++part) {
-                const auto& levers = w.levers[vectors_[a].first_leg + part];
+                const auto& arms = w.arms[vectors_[a].first_leg + part];
                 Vec3<double> before{}, beyond{};
-                for (const auto& lever : levers) {
-                    w.moved[a * n_ + lever.coordinate] += cross(before, lever.shift);
-                    before += v[lever.coordinate] * lever.turn;
+                for (const auto& arm : arms) {
+                    w.moved[a * n_ + arm.coordinate] += cross(before, arm.linear);
+                    before += v[arm.coordinate] * arm.angular;
                 }
-                for (std::size_t j = levers.size(); j-- > 0;) {
-                    beyond += v[levers[j].coordinate] * levers[j].shift;
-                    w.moved[a * n_ + levers[j].coordinate] += cross(levers[j].turn, beyond);
+                for (std::size_t j = arms.size(); j-- > 0;) {
+                    beyond += v[arms[j].coordinate] * arms[j].linear;
+                    w.moved[a * n_ + arms[j].coordinate] += cross(arms[j].angular, beyond);
                 }
                 w.weight[a] += beyond;
             }
@@ -266,7 +253,7 @@ class Constraints {
     struct Joined {
         VectorSum sum;
         std::vector<std::vector<int>> paths;  // bodies from the root to that of each part
-        std::size_t first_leg = 0;            // of its parts, in ConstraintJet::levers
+        std::size_t first_leg = 0;            // of its parts, in ConstraintJet::arms
         bool moves = false;                   // with any body; else it is constant
     };
 
@@ -292,7 +279,7 @@ class Constraints {
         w.at_q.resize(n_);
         w.custom.resize(customs_.empty() ? 0 : n_ * n_);
         w.at.resize(links_.bodies.size());
-        w.levers.resize(legs_);
+        w.arms.resize(legs_);
         w.value.resize(vectors_.size());
         w.reach.resize(vectors_.size());
         w.slope.resize(vectors_.size() * n_);
@@ -337,36 +324,70 @@ class Constraints {
         double reach = 0.0;
         const auto& parts = vectors_[a].sum.parts;
         for (std::size_t part = 0; part < parts.size(); ++part) {
-            const CarriedVector& carried = parts[part];
-            const double side = part == 0 ? 1.0 : -1.0;
-            auto& levers = w.levers[vectors_[a].first_leg + part];
-            levers.clear();
-            Vec3<double> x = carried.point;
-            if (carried.body >= 0) {
-                x = w.at[carried.body].rotation * carried.point;
-                if (!carried.direction) x += w.at[carried.body].position;
-            }
-            value += side * x;
+            auto& arms = w.arms[vectors_[a].first_leg + part];
+            arms.clear();
+            const std::vector<int>& path = vectors_[a].paths[part];
+            const Vec3<double> x = add_arms(links_, path, parts[part], static_cast<int>(part), w.at.data(), arms);
+            value = part == 0 ? x : value - x;
             reach += length(x);
-            for (int j : vectors_[a].paths[part]) {
-                const Body& link = links_.bodies[j];
-                if (carried.direction && link.prismatic) continue;
-                const Vec3<double>& axis = w.at[j].rotation.z;
-                const Motion<double> gives =
-                    carried.direction ? Motion<double>{cross(axis, x), axis} : given_by(link, w.at[j], x);
-                const ConstraintJet::Lever lever{link.coordinate, link.ratio * gives.angular,
-                                                 (side * link.ratio) * gives.linear};
-                slope[link.coordinate] += lever.shift;
-                const double moved = length(lever.shift);
-                size[link.coordinate] += moved;
+            for (std::size_t i = 0; i < arms.size(); ++i) {
+                const Arm<double>& arm = arms[i];
+                slope[arm.coordinate] += arm.linear;
+                const double moved = length(arm.linear);
+                size[arm.coordinate] += moved;
                 // The rounding of joint positions limits the precision of a point.
-                reach += moved * std::abs(q[link.coordinate]);
-                if (!carried.direction) reach += span_[j];
-                levers.push_back(lever);
+                reach += moved * std::abs(q[arm.coordinate]);
+                if (!parts[part].direction) reach += span_[path[i]];
             }
         }
         w.value[a] = value;
         w.reach[a] = reach;
+    }
+};
+
+// Joints whose motion is given: each moves to its goal, its entry of the step's force, at a constant rate, or on the
+// cubic between the rates at both ends, the second given by a control. Its row is g = q - (this motion), and no force
+// but the row's acts on it. A control that is held over several steps has its goal at the end of the last one.
+class KinematicInputs {
+  public:
+    explicit KinematicInputs(const std::vector<DrivenRow>& driven) : driven(driven) {
+        cubic = std::any_of(driven.begin(), driven.end(), [](const DrivenRow& own) { return own.rate >= 0; });
+    }
+
+    const std::vector<DrivenRow>& driven;
+    std::vector<double> goal = std::vector<double>(driven.size());
+    std::vector<double> goal_rate = goal, begun = goal;  // rates at the goal and at the beginning of the part
+    bool cubic = false;                                  // whether any is
+    int left = 1;                                        // steps to the goal
+    double share = 1.0;                                  // the next part's share of the time to the goal
+
+    int count() const { return static_cast<int>(driven.size()); }
+    // Index of the input of a row, or -1.
+    int of_row(int row) const {
+        for (int d = 0; d < count(); ++d) {
+            if (driven[d].row == row) return d;
+        }
+        return -1;
+    }
+
+    // The displacement is ahead * (distance to the goal) + T (begin * (rate at the start) + end * (rate at the goal)),
+    // with T the time to the goal.
+    struct Way {
+        double ahead, begin, end;
+    };
+    // These coefficients after the share `at` of T.
+    Way way_at(int d, double at) const {
+        if (driven[d].rate < 0) return {at, 0.0, 0.0};
+        return {at * at * (3.0 - 2.0 * at), at * (1.0 - at) * (1.0 - at), at * at * (at - 1.0)};
+    }
+    // Those of the rate: ahead * (distance / T) + begin * (rate at the start) + end * (rate at the goal).
+    Way pace_at(int d, double at) const {
+        if (driven[d].rate < 0) return {1.0, 0.0, 0.0};
+        return {6.0 * at * (1.0 - at), (1.0 - at) * (1.0 - 3.0 * at), at * (3.0 * at - 2.0)};
+    }
+    double rate_at(int d, double at, double h, double from) const {
+        const Way pace = pace_at(d, at);
+        return pace.ahead * share * (goal[d] - from) / h + pace.begin * begun[d] + pace.end * goal_rate[d];
     }
 };
 

@@ -23,20 +23,12 @@
 #include <variant>
 #include <vector>
 
-#include "varpin/body.hpp"
 #include "varpin/dual.hpp"
 #include "varpin/forces.hpp"
 #include "varpin/kinematics.hpp"
 #include "varpin/spatial.hpp"
 
 namespace varpin {
-
-// A point, relative to the joint of its body in body axes, or in the world for body -1. Or a direction.
-struct Anchor {
-    int body = -1;
-    Vec3<double> point{};  // [m]; a unit vector for a direction
-    bool direction = false;
-};
 
 namespace detail {
 
@@ -176,15 +168,6 @@ using CoupledElement =
 // A force F (n) on all coordinates at q and v (n), evaluated by code outside of the core, with dF/dq and dF/dv (n, n),
 // which may be null.
 using OuterForce = std::function<void(const double* q, const double* v, double* F, double* by_q, double* by_v)>;
-
-// Velocities of one of the points per unit rate of a joint.
-template <class T>
-struct Arm {
-    int coordinate = 0;
-    int point = 0;      // 0 for a, 1 for b
-    Vec3<T> linear{};   // of d
-    Vec3<T> angular{};  // of the point's body
-};
 
 // Work arrays; Couplings::fit allocates them, at their first use at the latest.
 template <class T>
@@ -340,20 +323,10 @@ class Couplings {
         workspace.arms.clear();
         const Anchor* const anchors[2] = {&element.a, &element.b};
         for (int point = 0; point < 2; ++point) {
-            const auto& [body, offset, direction] = *anchors[point];
-            Vec3<T>& x = workspace.point[point];
-            x = {T(offset.x), T(offset.y), T(offset.z)};
-            if (body < 0) continue;
-            x = workspace.at[body].rotation * offset;
-            if (!direction) x += workspace.at[body].position;
-            if (point == 0) workspace.rotation = workspace.at[body].rotation;
-            for (int j : joined.path[point]) {
-                const Body& link = links_.bodies[j];
-                const double side = point == 0 ? link.ratio : -link.ratio;
-                const Motion<T> gives = given_by(link, workspace.at[j], x);
-                const Vec3<T> linear = direction ? cross(gives.angular, x) : gives.linear;
-                workspace.arms.push_back({link.coordinate, point, side * linear, link.ratio * gives.angular});
-            }
+            const Anchor& anchor = *anchors[point];
+            workspace.point[point] =
+                add_arms(links_, joined.path[point], anchor, point, workspace.at.data(), workspace.arms);
+            if (point == 0 && anchor.body >= 0) workspace.rotation = workspace.at[anchor.body].rotation;
         }
     }
 

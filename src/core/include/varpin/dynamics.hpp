@@ -1,16 +1,9 @@
-// Forward dynamics and its derivatives, for the integrators on (q, v). docs/mathematics.md, "Explicit methods". Inverse
-// dynamics by the recursive Newton-Euler algorithm is tau = S . Phi, with Phi the force on the subtree of a joint. Its
-// derivatives follow from the rotate-along rule of the jet. For a body b below i, with V_p and A_p the velocity and
-// acceleration (minus gravity) of i's parent, (dq_i, dv_i) change velocity and acceleration by
-//
-//     dV_b = W_i dq_i + S_i dv_i,    dA_b = Z_i dq_i + 2 W_i dv_i + dV_b x V_b,    Z_i = A_p x S_i + V_p x W_i,
-//
-// so that with U_i = (W_i, S_i), X_i = (Z_i, 2 W_i), columns for (dq_i, dv_i), C of `Coupling` and inertia Y summed
-// over the subtree of a joint, and i an ancestor of j or j itself
+// Forward dynamics and its derivatives, for the integrators on (q, v). docs/mathematics.md, "Explicit methods";
+// equations (X3) and (X4). Inverse dynamics is tau = S . Phi, with Phi the force on the subtree of a joint. With
+// U_i = (W_i, S_i), X_i = (Z_i, 2 W_i), columns for (dq_i, dv_i), and C of `Coupling`, i an ancestor of j or j itself:
 //
 //     dtau_j/d(q,v)_i = F_j . X_i + (C_j' S_j) . U_i
 //     dtau_i/d(q,v)_j = S_i . (Y_j X_j + C_j U_j + (S_j x* Phi_j, 0))
-// Equations (X3) and (X4) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>
@@ -20,9 +13,9 @@
 #include "varpin/dense.hpp"
 #include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
+#include "varpin/mechanism.hpp"
 #include "varpin/slopes.hpp"
 #include "varpin/spatial.hpp"
-#include "varpin/tree.hpp"
 
 namespace varpin {
 

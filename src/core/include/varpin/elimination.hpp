@@ -1,32 +1,13 @@
-// Solves with the matrix of a midpoint step by elimination from the leaves to the roots, without forming the matrix;
-// the work is proportional to the number of bodies. docs/mathematics.md, "Linear in the number of joints". For a joint
-// j and an ancestor i,
-//
-//     N = M + ha A - hb A' - ha hb L_qq + diag(d)
-//     N_ij = row_i . (Y_j column_j) + row_i . u0_j,      u0 = ha (S x* H, g x (Y S)(linear))
-//     N_ji = (Y_j row_j) . column_i + l0_j . column_i,   l0 = -hb (S x* H, -g x (Y S)(linear))
-//
-// with nine entries each, row = (S - hb W, hb S(angular)) and column = (S + ha W, ha S(angular)); the inertia Y of the
-// subtree of j multiplies the first six. After elimination of the subtree below j, its force for a motion w is X w + z.
-// So, with x the coordinate and w = w_parent + column x,
-//
-//     u = X column + u0,  l = X' row + l0,  D = d + row . u:      x = (r - row . z) / D - l . w_parent / D
-//     passed to the parent: X - u l' / D,  z + u (r - row . z) / D.
-//
-// The symmetric part M + c (A + A') - k L_qq is eliminated in the same way with rows and columns (S, W) of twelve
-// entries, and M alone with S: the articulated body algorithm (Featherstone 2008).
-//
-// For collocation with s stages a joint has one unknown for each stage, and
-//
-//     N_im = delta_im M_i + h (a_im A_i - abar_im A_m') - h^2 sum_c abar_ic a_cm L_qq,c + diag(d_im)
-//
-// is a sum over stages c of this form, with
+// Solves with the matrix of a step by elimination from the leaves to the roots, without forming the matrix: the work is
+// proportional to the number of bodies. docs/mathematics.md, "Linear in the number of joints"; equations (E1) to (E4).
+// Here a joint has one unknown for each stage c, and its rows and columns nine entries for each:
 //
 //     row_i = (delta_ic S - h abar_ic W, h abar_ic S(angular))_c      u0_m = h a_cm (S x* H, g x (Y S)(linear))_c
 //     column_m = (delta_cm S + h a_cm W, h a_cm S(angular))_c         l0_i = -h abar_ic (S x* H, -g x (Y S)(linear))_c
 //
-// each with nine entries for each c; D is a matrix (s, s).
-// Equations (E1), (E2), (E3) and (E4) of docs/mathematics.md.
+// After elimination of the subtree below j, its force for a motion w is X w + z, and u = X column + u0, l = X' row +
+// l0, D = d + row . u is a matrix (s, s). The symmetric part is eliminated in the same way with rows and columns (S,
+// W).
 #pragma once
 
 #include <algorithm>
@@ -38,11 +19,11 @@
 #include "varpin/dense.hpp"
 #include "varpin/elimination_rows.hpp"
 #include "varpin/jet.hpp"
+#include "varpin/mechanism.hpp"
 #include "varpin/spatial.hpp"
 #include "varpin/subtree_sums.hpp"
 #include "varpin/symmetric_elimination.hpp"
 #include "varpin/tableau.hpp"
-#include "varpin/tree.hpp"
 
 namespace varpin {
 

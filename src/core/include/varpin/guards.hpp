@@ -1,16 +1,9 @@
-// Conditions on accepted steps. docs/mathematics.md, "The principal branch".
+// Conditions on accepted steps. docs/mathematics.md, "The principal branch"; equation (G1).
 //
-// The branch guard: the step equation has other roots than the one that is connected to h -> 0. At that root the
-// symmetric part of N = -dr/dv is positive definite. Its pivots, with an exaggerated destabilising term, are compared
-// with those of M. The smallest ratio is no smaller than the least eigenvalue of one in the metric of the other, and
-// has its sign.
-//
-// The energy guard: |dE - work of the forces| over a substep must be a small part of the energy turned over, for each
-// mechanically independent group. That balance does not resolve parts that ride on far heavier ones, so light parts
-// have a balance of their own. With coordinates i of the part and coordinates a of its carrier, the Jacobi energy
-// J = sum_i p_i v_i - L of the part's bodies changes by dJ = sum_i F_i dq_i - sum_a (L_q,a dq_a + L_v,a dv_a), with
-// L_q,a and L_v,a by the trapezoidal rule.
-// Equation (G1) of docs/mathematics.md.
+// The branch guard: the step equation has other roots than the one that is connected to h -> 0, where the symmetric
+// part of N = -dr/dv is positive definite. The energy guard: |dE - work of the forces| over a substep must be a small
+// part of the energy turned over, for each mechanically independent group. That balance does not resolve parts that
+// ride on far heavier ones, so light parts have a balance of their own, of their Jacobi energy sum_i p_i v_i - L.
 #pragma once
 
 #include <algorithm>

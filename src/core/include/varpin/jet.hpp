@@ -19,10 +19,10 @@
 
 #include "varpin/dual.hpp"
 #include "varpin/elementary.hpp"
+#include "varpin/mechanism.hpp"
 #include "varpin/size.hpp"
 #include "varpin/slopes.hpp"
 #include "varpin/spatial.hpp"
-#include "varpin/tree.hpp"
 
 namespace varpin {
 

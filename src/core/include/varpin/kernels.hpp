@@ -2,12 +2,14 @@
 // same templates, and the same bytes. Everything above them is compiled once. docs/core.md, "Processors".
 #pragma once
 
+#include <algorithm>
 #include <cstddef>
+#include <limits>
 #include <vector>
 
+#include "varpin/dense.hpp"
 #include "varpin/jet.hpp"
 #include "varpin/size.hpp"
-#include "varpin/velocity_slopes.hpp"
 
 namespace varpin {
 
@@ -16,6 +18,32 @@ class StepEquation;
 class EnergyGuard;
 struct Guards;
 struct Start;
+
+// The derivative of v in (q, p) (rows, n, 2n), into `slopes`, at each row of q and v (rows, n): at fixed q dv = M^-1
+// dp, at fixed p dv = -M^-1 L_vq dq. NaN where M is not positive definite; entries outside of blocks stay. The number
+// of joints may be known at compile time.
+template <class Size>
+void velocity_slopes(const Mechanism& mechanism, std::size_t rows, const double* q, const double* v, double* slopes) {
+    const Size n = mechanism.dof();
+    const int width = 2 * n;
+    Jet<double> jet(mechanism.tree);
+    for (std::size_t s = 0; s < rows; ++s) {
+        momentum_slopes<Size>(mechanism, q + s * n, v + s * n, jet);
+        double* slope = slopes + s * n * width;
+        for (int i = 0; i < n; ++i) {
+            for (int j = 0; j < n; ++j) slope[i * width + j] = -jet.A[i * n + j];
+            slope[i * width + n + i] = 1.0;
+        }
+        for (const Block& block : blocks_of(mechanism.tree, n)) {
+            double* first = slope + block.begin * width;
+            if (factor_ldl(jet.M.data(), n, block)) {
+                solve_ldl_rows(jet.M.data(), n, block, first, width, width);
+            } else {
+                std::fill_n(first, (block.end - block.begin) * width, std::numeric_limits<double>::quiet_NaN());
+            }
+        }
+    }
+}
 
 // The parts of Collocation are those for a single stage.
 struct Kernels {

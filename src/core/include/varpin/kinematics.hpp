@@ -6,11 +6,25 @@
 #include <cmath>
 #include <vector>
 
-#include "varpin/body.hpp"
 #include "varpin/elementary.hpp"
 #include "varpin/spatial.hpp"
 
 namespace varpin {
+
+// Body and joint. The joint position is ratio * q[coordinate] + offset; mimic joints have ratios other than 1.
+struct Body {
+    int parent = -1;  // -1 for a root; parents come first
+    bool prismatic = false;
+    Mat3<double> rotation{};     // of the joint's frame in the parent body, at joint position 0
+    Vec3<double> translation{};  // [m]
+    double mass = 0.0;           // [kg]
+    Vec3<double> center{};       // in the body's frame [m]
+    Sym3<double> inertia{};      // about the centre, in the body's axes [kg m^2]
+    int coordinate = 0;
+    double ratio = 1.0;
+    double offset = 0.0;  // [rad or m]
+    bool origin = false;  // no ancestor is revolute: moments of this branch are taken about this joint
+};
 
 template <class T>
 struct PlacementOf {
@@ -95,6 +109,40 @@ template <class T>
 Motion<T> given_by(const Body& link, const PlacementOf<T>& at, const Vec3<T>& point) {
     const Vec3<T>& axis = at.rotation.z;
     return link.prismatic ? Motion<T>{axis, {}} : Motion<T>{cross(axis, point - at.position), axis};
+}
+
+// A point, relative to the joint of its body in body axes, or in the world for body -1. Or a direction.
+struct Anchor {
+    int body = -1;
+    Vec3<double> point{};  // [m]; a unit vector for a direction
+    bool direction = false;
+};
+
+// Velocities of one of the points per unit rate of a joint.
+template <class T>
+struct Arm {
+    int coordinate = 0;
+    int point = 0;      // 0 for a, 1 for b
+    Vec3<T> linear{};   // of a - b
+    Vec3<T> angular{};  // of the point's body
+};
+
+// Adds the arms of an anchor, from the root on; `path` are the bodies that move it. Returns its place.
+template <class T>
+Vec3<T> add_arms(const Links& links, const std::vector<int>& path, const Anchor& anchor, int point,
+                 const PlacementOf<T>* at, std::vector<Arm<T>>& arms) {
+    const Vec3<double>& offset = anchor.point;
+    if (anchor.body < 0) return {T(offset.x), T(offset.y), T(offset.z)};
+    Vec3<T> x = at[anchor.body].rotation * offset;
+    if (!anchor.direction) x += at[anchor.body].position;
+    for (int j : path) {
+        const Body& link = links.bodies[j];
+        const double side = point == 0 ? link.ratio : -link.ratio;
+        const Motion<T> gives = given_by(link, at[j], x);
+        const Vec3<T> linear = anchor.direction ? cross(gives.angular, x) : gives.linear;
+        arms.push_back({link.coordinate, point, side * linear, link.ratio * gives.angular});
+    }
+    return x;
 }
 
 // The Jacobian (6, n) of a frame at a point of the last body: linear, then angular velocity, in world axes.

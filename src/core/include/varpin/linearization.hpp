@@ -1,14 +1,9 @@
-// Derivatives of the steps of a trajectory, first and second. docs/mathematics.md, "Linearization" and
-// "Second derivatives".
+// Derivatives of the steps of a trajectory, first and second. docs/mathematics.md, "Linearization" and "Second
+// derivatives"; equation (L4). With multipliers lam, N' lam = dphi/dV, second derivatives of phi = zq . q1 + zp . p1
+// need first derivatives of V alone, and those of psi = sum_i alpha_i . L_q + beta_i . L_v + gamma_i . F at the stages
+// with
 //
-// For z = (zq, zp), phi = zq . q1 + zp . p1 is added to the step equation with multipliers lam_i that make the sum
-// stationary in V: N' lam = dphi/dV. The part of the sum that is nonlinear in (q0, p0, f, V) is
-//
-//     psi = sum_i alpha_i . L_q(Q_i, V_i) + beta_i . L_v(Q_i, V_i) + gamma_i . F(Q_i, V_i, f),
-//     alpha_i = h (b_i zp + sum_j abar_ji lam_j),    beta_i = -lam_i,    gamma_i = h (b_i zp + sum_j f_ji lam_j),
-//
-// and at a root first derivatives of V suffice: d2 phi = sum_i (dQ_i, dV_i, df)' d2 psi_i (dQ_i, dV_i, df).
-// Equation (L4) of docs/mathematics.md.
+//     alpha_i = h (b_i zp + sum_j abar_ji lam_j),    beta_i = -lam_i,    gamma_i = h (b_i zp + sum_j f_ji lam_j).
 #pragma once
 
 #include <algorithm>

@@ -10,8 +10,8 @@
 #include <cstdint>
 #include <vector>
 
+#include "varpin/mechanism.hpp"
 #include "varpin/nodes.hpp"
-#include "varpin/tree.hpp"
 
 namespace varpin {
 

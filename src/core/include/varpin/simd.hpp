@@ -9,13 +9,15 @@
 #include <cstddef>
 #include <vector>
 
-#if defined(__x86_64__) && defined(__GNUC__)
+#if defined(__x86_64__)
 #include <cpuid.h>
 #endif
 
 namespace varpin {
 
-#if defined(__GNUC__)
+#if !defined(__GNUC__)
+#error "varpin needs GCC or Clang, whose vectors of numbers it uses"
+#endif
 
 // Without alignment beyond that of double.
 typedef double Pair __attribute__((vector_size(16), aligned(8), may_alias));
@@ -26,39 +28,10 @@ inline void put_pair(Pair a, double* x) { *reinterpret_cast<Pair*>(x) = a; }
 // Functions take and return references, since how four numbers are passed depends on the processor.
 typedef double Quad __attribute__((vector_size(32), aligned(8), may_alias));
 
-#else
-
-struct Pair {
-    double values[2];
-    double operator[](int k) const { return values[k]; }
-};
-
-inline Pair operator+(Pair a, Pair b) { return {{a[0] + b[0], a[1] + b[1]}}; }
-inline Pair operator-(Pair a, Pair b) { return {{a[0] - b[0], a[1] - b[1]}}; }
-inline Pair operator*(Pair a, Pair b) { return {{a[0] * b[0], a[1] * b[1]}}; }
-inline Pair pair_at(const double* x) { return {{x[0], x[1]}}; }
-inline void put_pair(Pair a, double* x) { x[0] = a[0], x[1] = a[1]; }
-
-struct Quad {
-    double values[4];
-};
-
-inline Quad operator+(const Quad& a, const Quad& b) {
-    return {
-        {a.values[0] + b.values[0], a.values[1] + b.values[1], a.values[2] + b.values[2], a.values[3] + b.values[3]}};
-}
-inline Quad operator*(const Quad& a, const Quad& b) {
-    return {
-        {a.values[0] * b.values[0], a.values[1] * b.values[1], a.values[2] * b.values[2], a.values[3] * b.values[3]}};
-}
-inline Quad& operator+=(Quad& a, const Quad& b) { return a = a + b; }
-
-#endif
-
 inline Quad& quad_at(double* x) { return *reinterpret_cast<Quad*>(x); }
 inline const Quad& quad_at(const double* x) { return *reinterpret_cast<const Quad*>(x); }
 
-#if defined(__x86_64__) && defined(__GNUC__)
+#if defined(__x86_64__)
 
 namespace detail {
 
@@ -153,7 +126,7 @@ template <bool adds, bool pairs>
     }
 }
 
-#if defined(__x86_64__) && defined(__GNUC__)
+#if defined(__x86_64__)
 // The same sums four at a time: no other bytes, and half the instructions.
 template <bool adds>
 [[gnu::target("avx2")]] void find_tiles_by_avx2(const TiledMatrix& a, const TiledMatrix& b, Range range,
@@ -167,7 +140,7 @@ template <bool adds>
 // The leading `rows` rows of out += a'b, over the rows of a and b in `range`, for the columns that both have.
 inline void add_transposed_product(const TiledMatrix& a, const TiledMatrix& b, Range range, TiledMatrix& out, int rows,
                                    Part part = Part::all) {
-#if defined(__x86_64__) && defined(__GNUC__)
+#if defined(__x86_64__)
     if (has_avx2()) return detail::find_tiles_by_avx2<true>(a, b, range, out, rows, part);
 #endif
     detail::find_tiles<true, false>(a, b, range, out, rows, part);
@@ -176,7 +149,7 @@ inline void add_transposed_product(const TiledMatrix& a, const TiledMatrix& b, R
 // The same of out = a'b: whatever was there is gone.
 inline void transposed_product(const TiledMatrix& a, const TiledMatrix& b, Range range, TiledMatrix& out, int rows,
                                Part part = Part::all) {
-#if defined(__x86_64__) && defined(__GNUC__)
+#if defined(__x86_64__)
     if (has_avx2()) return detail::find_tiles_by_avx2<false>(a, b, range, out, rows, part);
 #endif
     detail::find_tiles<false, false>(a, b, range, out, rows, part);
@@ -206,7 +179,7 @@ template <int tiles>
     if (c < columns) add_rows_at<1>(c, factor, a, range, out);
 }
 
-#if defined(__x86_64__) && defined(__GNUC__)
+#if defined(__x86_64__)
 [[gnu::target("avx2")]] inline void add_rows_by_avx2(const double* factor, const TiledMatrix& a, Range range,
                                                      double* out, int columns) {
     add_some_rows(factor, a, range, out, columns);
@@ -217,7 +190,7 @@ template <int tiles>
 
 // out += sum_i factor_i a_i over the rows of a in `range`, one after another; out has whole tiles.
 inline void add_rows(const double* factor, const TiledMatrix& a, Range range, double* out, int columns) {
-#if defined(__x86_64__) && defined(__GNUC__)
+#if defined(__x86_64__)
     if (has_avx2()) return detail::add_rows_by_avx2(factor, a, range, out, columns);
 #endif
     detail::add_some_rows(factor, a, range, out, columns);

@@ -1,18 +1,11 @@
 // The backward pass on a square root of the value's Hessian, for problems in which the plain recursion loses all
-// digits. docs/mathematics.md, "Digits".
-//
-// The value is stored as a sum of squares (1/2) |R x + r|^2, without its Hessian R'R. With the running cost as squares
-// (1/2) |L z + l|^2 too, the cost to go from a step is a sum of squares in (u, x). An orthogonal transformation
-// brings their rows to
+// digits. docs/mathematics.md, "Digits"; equation (O3). The value is a sum of squares (1/2) |R x + r|^2, and so is the
+// cost to go from a step in (u, x), whose rows an orthogonal transformation brings to
 //
 //     ( R_uu  R_ux  r_u )        K = -R_uu^-1 R_ux,  k = -R_uu^-1 r_u,
-//     (   0   R_xx  r_x )        and the last rows are the value before the step
+//     (   0   R_xx  r_x )        and the last rows are the value before the step.
 //
-// (Kailath, Sayed and Hassibi, Linear Estimation, 2000, chapter 12). Rounding errors are eps times the root of the
-// largest terms, instead of eps times these terms in the plain recursion, so that weights may differ by twice as many
-// orders of magnitude. Every Hessian must be positive semidefinite; the part of a gradient outside its range is stored
-// separately.
-// Equation (O3) of docs/mathematics.md.
+// Every Hessian must be positive semidefinite; the part of a gradient outside its range is stored separately.
 #pragma once
 
 #include <algorithm>
@@ -21,8 +14,6 @@
 #include <limits>
 #include <vector>
 
-#include "varpin/linear_step.hpp"
-#include "varpin/orthogonal.hpp"
 #include "varpin/steps.hpp"
 
 namespace varpin {
@@ -36,6 +27,54 @@ struct Squares {
 
     const double* root_of(std::ptrdiff_t point, int size) const { return one_root ? root : root + point * size * size; }
 };
+
+// Overwrites a (rows, columns) so that its first `leading` columns are triangular, leading <= min(rows, columns). The
+// signs of rows are arbitrary. `work` is (columns).
+//
+// The row with the largest entry in a column is the pivot row. Otherwise a large row with a zero there would destroy
+// digits of small rows (Powell and Reid, "On applying Householder transformations to linear least squares problems",
+// 1969).
+inline void triangularize(double* a, int rows, int columns, int leading, double* __restrict work) {
+    for (int k = 0; k < leading; ++k) {
+        int best = k;
+        for (int i = k + 1; i < rows; ++i) {
+            if (std::abs(a[i * columns + k]) > std::abs(a[best * columns + k])) best = i;
+        }
+        const double largest = std::abs(a[best * columns + k]);
+        if (!(largest > 0.0)) continue;
+        double total = 0.0;
+        for (int i = k; i < rows; ++i) {
+            const double part = a[i * columns + k] / largest;
+            total += part * part;
+        }
+        double* __restrict top = a + k * columns;
+        if (best != k) std::swap_ranges(top, top + columns, a + best * columns);
+        const double norm = largest * std::sqrt(total);
+        const double end = top[k] > 0.0 ? -norm : norm;
+        // The vector of the reflection, scaled by its first entry, is (1, w) with length^2 = 2 norm / (norm + |a_kk|).
+        const double first = top[k] - end, factor = (norm + std::abs(top[k])) / norm;
+        for (int j = k + 1; j < columns; ++j) work[j] = top[j];
+        for (int i = k + 1; i < rows; ++i) {
+            double* __restrict row = a + i * columns;
+            row[k] /= first;
+            const double entry = row[k];
+            if (entry == 0.0) continue;
+            for (int j = k + 1; j < columns; ++j) work[j] += entry * row[j];
+        }
+        for (int j = k + 1; j < columns; ++j) {
+            work[j] *= factor;
+            top[j] -= work[j];
+        }
+        for (int i = k + 1; i < rows; ++i) {
+            double* __restrict row = a + i * columns;
+            const double entry = row[k];
+            row[k] = 0.0;
+            if (entry == 0.0) continue;
+            for (int j = k + 1; j < columns; ++j) row[j] -= entry * work[j];
+        }
+        top[k] = end;
+    }
+}
 
 // A stack of rows of equal length.
 class RowStack {

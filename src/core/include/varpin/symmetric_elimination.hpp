@@ -10,8 +10,8 @@
 
 #include "varpin/elimination_rows.hpp"
 #include "varpin/jet.hpp"
+#include "varpin/mechanism.hpp"
 #include "varpin/subtree_sums.hpp"
-#include "varpin/tree.hpp"
 
 namespace varpin {
 

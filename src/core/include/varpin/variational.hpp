@@ -22,48 +22,41 @@ struct PathState {
     static constexpr int most_misses = 3;
 
     PathState(const Mechanism& mechanism, int stages)
-        : position(mechanism.dof()),
-          p(mechanism.dof()),
-          q(mechanism.dof()),
-          momentum(mechanism.dof()),
-          v(mechanism.dof()),
+        : n(mechanism.dof()),
+          m(mechanism.constraints.rows()),
+          stages(stages),
+          position(n),
+          p(n),
           energies(mechanism.tree),
-          center(mechanism.dof() * mechanism.diffusion.processes),
-          past(stages * mechanism.dof()),
-          miss(most_misses * stages * mechanism.dof()),
-          past_end(mechanism.dof()),
-          past_force(mechanism.dof()),
-          rate(mechanism.constraints.rows()),
-          impulse(mechanism.constraints.rows()),
-          past_impulse(stages * mechanism.constraints.rows()),
-          impulse_miss(most_misses * past_impulse.size()) {}
+          center(zeros(n, mechanism.diffusion.processes)) {}
 
+    int n, m, stages;  // coordinates, rows of constraints
     std::vector<Coordinate> position;
     std::vector<Compensated> p;
-    std::vector<double> q;         // (n) rounded, with whole turns
-    std::vector<double> momentum;  // (n) p, rounded
-    std::vector<double> v;         // (n) M(q)^-1 p
+    std::vector<double> q = zeros(n);         // rounded, with whole turns
+    std::vector<double> momentum = zeros(n);  // p, rounded
+    std::vector<double> v = zeros(n);         // M(q)^-1 p
     Energies energies;
-    std::vector<double> center;          // (n, k) of the diffusion fields, for this rollout
-    std::vector<double> past;            // (s, n) stage velocities of the last whole step
-    std::vector<double> miss;            // (misses, s, n) error of the guess of these velocities, and its backward
-                                         // differences over the steps before
-    std::vector<double> past_end;        // (n) velocity at the end of that step
-    std::vector<double> past_force;      // (n) force of that step
+    std::vector<double> center;                                 // (n, k) of the diffusion fields, for this rollout
+    std::vector<double> past = zeros(stages, n);                // stage velocities of the last whole step
+    std::vector<double> miss = zeros(most_misses * stages, n);  // error of the guess of these velocities, and its
+                                                                // backward differences over the steps before
+    std::vector<double> past_end = zeros(n);                    // velocity at the end of that step
+    std::vector<double> past_force = zeros(n);                  // force of that step
     int known = 0;                       // consecutive whole steps before, up to the number in use
     int trend = 0;                       // number of rows of `miss` that would have predicted the last step best
     int level = 0;                       // halvings of the last step
     std::vector<std::uint8_t> halvings;  // of each part of every divided step in the last `roll`
 
     // Under constraints with m rows:
-    int rank = -1;                     // of the constraints, for the whole rollout
-    int weakest = 0;                   // the row that a failed step would name
-    std::vector<double> rate;          // (m) rates of kinematic inputs at the node; zero for other rows
-    std::vector<double> impulse;       // (m) impulses of the last step, the negative sum of Lam [N s or N m s]
-    std::vector<double> past_impulse;  // (s, m) Lam of the last whole step
-    std::vector<double> impulse_miss;  // (misses, s, m) errors of its guess, as `miss`
-    int impulse_trend = 0;             // as `trend`
-    std::vector<double> impulses;      // (steps, m) impulses of the last roll
+    int rank = -1;                           // of the constraints, for the whole rollout
+    int weakest = 0;                         // the row that a failed step would name
+    std::vector<double> rate = zeros(m);     // rates of kinematic inputs at the node; zero for other rows
+    std::vector<double> impulse = zeros(m);  // impulses of the last step, the negative sum of Lam [N s or N m s]
+    std::vector<double> past_impulse = zeros(stages, m);                // Lam of the last whole step
+    std::vector<double> impulse_miss = zeros(most_misses * stages, m);  // errors of its guess, as `miss`
+    int impulse_trend = 0;                                              // as `trend`
+    std::vector<double> impulses;                                       // (steps, m) impulses of the last roll
 };
 
 // Writes the error of a guess (size) and its backward differences over `known` guesses into `miss` (misses, size). The

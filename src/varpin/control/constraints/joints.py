@@ -19,22 +19,16 @@ _SPEED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class _BoundBox(BoundConstraint):
-    in_velocity: bool
-    columns: Integers  # the coordinate of each row
-    signs: Floats  # 1 for upper limits, -1 for lower ones
-    bounds: Floats  # signs times the limits
+class _BoundLinear(BoundConstraint):
+    slopes: Floats  # in (q, v), (rows, 2n)
+    bounds: Floats  # (rows,)
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
-        y = (v if self.in_velocity else q)[..., self.places, :]
-        found: Floats = y[..., self.columns] * self.signs - self.bounds
+        found: Floats = np.concatenate([q, v], axis=-1)[..., self.places, :] @ self.slopes.T - self.bounds
         return found
 
     def jacobian(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
-        n = q.shape[-1]
-        one = np.zeros((len(self.rows), 2 * n))
-        one[np.arange(len(self.rows)), self.columns + (n if self.in_velocity else 0)] = self.signs
-        return np.broadcast_to(one, (len(self.places), *one.shape))
+        return np.broadcast_to(self.slopes, (len(self.places), *self.slopes.shape))
 
 
 class _WithinLimits(PlanConstraint):
@@ -68,11 +62,12 @@ class _WithinLimits(PlanConstraint):
         require_same(self.label, self.robot, horizon.robot)
         # Upper limits, then lower ones.
         sides, columns = np.nonzero(np.isfinite(self.limits[::-1]))
-        signs = np.where(sides == 0, 1.0, -1.0)
+        signs, slopes = np.where(sides == 0, 1.0, -1.0), np.zeros((len(sides), 2 * self.robot.dof))
+        slopes[np.arange(len(sides)), columns + self.in_velocity * self.robot.dof] = signs
         names = ("upper", "lower")
         ranges = self.limits[1] - self.limits[0]
         whole = ranges[np.isfinite(ranges) & (ranges > 0.0)]
-        return _BoundBox(
+        return _BoundLinear(
             self,
             *horizon.places,
             tuple(
@@ -80,9 +75,7 @@ class _WithinLimits(PlanConstraint):
             ),
             joint_unit(self.robot, sorted(set(columns.tolist())), speed=self.in_velocity),
             0.1 * float(np.median(whole)) if whole.size else (_SPEED if self.in_velocity else LENGTH),
-            self.in_velocity,
-            columns,
-            signs,
+            slopes,
             signs * self.limits[::-1][sides, columns],
         )
 

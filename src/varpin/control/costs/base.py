@@ -7,7 +7,6 @@ own in the core, custom costs with NumPy, without compiled code.
 
 from __future__ import annotations
 
-import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -389,17 +388,11 @@ def sample(
         CostError: A function that raises, or returns another shape or values that are not finite.
     """
     if callable(reference):
-        times = points.t.tolist()
-        # All at once, as there may be many thousands; one by one only to say which of them is wrong.
-        with contextlib.suppress(Exception):
-            rows = np.array([reference(t) for t in times])
-            if rows.shape == (len(times), *shape) and rows.dtype.kind in "fiu" and np.isfinite(rows).all():
-                return np.ascontiguousarray(rows, dtype=np.float64)
         try:
-            found = [returned("the reference", partial(reference, t), shape, f" at t = {t:.6g} s") for t in times]
+            given = [(partial(reference, t), shape, f" at t = {t:.6g} s") for t in points.t.tolist()]
+            return np.array([returned("the reference", *each) for each in given])
         except InputError as error:
             raise CostError(name, str(error)) from error
-        return np.array(found)
     array = require_finite(f"{name} reference", as_floats(f"{name} reference", reference))
     steps, N = points.steps, points.steps + 1
     if array.shape in ((), shape):

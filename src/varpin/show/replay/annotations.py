@@ -58,16 +58,9 @@ def paths(
     end: float,
     growing: Floats | None,
 ) -> list[Path]:
-    """The paths of frames along a motion up to a time, without those of frames that do not move.
+    """The paths of frames along a motion, q (N + 1, n) at t (N + 1,), up to a time, without frames that do not move.
 
-    Args:
-        kind: Whether it is the motion of the robot or of its ghost.
-        robot: The robot.
-        names: Names of its frames.
-        t: Times (N + 1,) [s].
-        q: Configurations (N + 1, n) [rad or m], linear in between as on the page.
-        end: End of the replay [s].
-        growing: Times of the keyframes (K,) [s], to let paths grow with the motion; None for whole paths.
+    With times of keyframes (K,) as ``growing`` [s], paths grow with the motion.
     """
     times = np.append(t[t < end], min(end, t[-1]))
     pieces = len(times) - 1
@@ -130,10 +123,6 @@ def _distinct(points: Floats) -> list[int]:
 def target_rows(given: Mapping[str, object] | None, end: float) -> dict[str, tuple[Floats, Floats | None]]:
     """Positions (K, 3) [m] of each target and, for poses, quaternions (K, 4); one row if it is fixed.
 
-    Args:
-        given: Points (3,), poses (4, 4), pin.SE3, or rows of either, spread evenly over the motion's time.
-        end: End of the motion [s].
-
     Raises:
         InputError: A target is none of these, is not finite, or has no rotation; or it moves and the motion does not.
     """
@@ -175,13 +164,8 @@ def surroundings(
 ) -> list[Mark]:
     """Triads of frames, ties of the mechanism, obstacles, regions, targets and goals of a plan.
 
-    Args:
-        robot: The robot.
-        marks: What to show.
-        frames: Names of frames that have triads.
-        source: The plan or the controller's run that is shown, or what else has a scene or constraints.
-        times: Times of the keyframes (K,), up to the end of the motion [s].
-        end: End of the motion [s].
+    They are at the keyframes (K,), up to the end of the motion [s]. ``source`` is the plan or the controller's run that
+    is shown, or a scene or problem.
     """
     scene, wanted, begin = _task(marks.constraints, source, robot)
     targets = []
@@ -287,12 +271,8 @@ def _goals(constraints: Sequence[PlanConstraint], taken: Sequence[Target]) -> li
 def torque_shares(robot: Robot, given: object, torques: object) -> Floats | None:
     """Torque of each joint in each step as a share of its limit (N, n), in [0, 1]; None if torques are not shown.
 
-    A joint without a limit is held against its own largest torque.
-
-    Args:
-        robot: The robot.
-        given: The motion, whose controls are the torques if ``torques`` is True.
-        torques: True, False, or the torques (N, n).
+    ``torques`` are given (N, n), or True for the motion's controls. A joint without a limit is held against its own
+    largest torque.
 
     Raises:
         InputError: The motion does not have torques of all joints, or they are not (N, n).

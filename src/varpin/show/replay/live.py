@@ -28,11 +28,10 @@ from varpin.model import Robot
 from varpin.show.given import frame_names
 from varpin.show.replay import forms
 from varpin.show.replay.annotations import references, require_marks, rows_at, surroundings
-from varpin.show.replay.drawing import Actor, Script, draw, joint_motion, mark_name, mark_node, tree_positions
+from varpin.show.replay.drawing import Actor, Script, draw, joint_motion, mark_name, mark_node, set_view, tree_positions
 from varpin.show.replay.marks import KINDS, LABEL, TUBE, Tie, translation
 from varpin.show.replay.page import open_browser
 from varpin.show.replay.picture import label
-from varpin.show.replay.view import set_view
 from varpin.support.checks import flag, positive
 from varpin.trajectory import Nodes
 

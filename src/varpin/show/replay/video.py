@@ -164,13 +164,7 @@ def _browser(size: tuple[int, int]) -> Iterator[Chrome]:
 def film_frames(
     page: Path, times: Floats, size: tuple[int, int], scripts: Sequence[tuple[str, Sequence[float]]] = ()
 ) -> Iterator[NDArray[np.uint8]]:
-    """A page's picture (height, width, 3) at each time.
-
-    Args:
-        page: The HTML file.
-        times: Times of the pictures [s of playback].
-        size: Width and height [pixels].
-        scripts: JavaScript to run first, with its arguments.
+    """A page's picture (height, width, 3) at each time [s of playback], after ``scripts`` with their arguments.
 
     Raises:
         VarpinError: The browser cannot show the page.

@@ -1,0 +1,26 @@
+// What the units of bindings give each other. docs/core.md, "The map".
+#pragma once
+
+#include <memory>
+#include <vector>
+
+namespace varpin {
+
+struct Guards;
+struct Kernels;
+struct Mechanism;
+struct Tableau;
+class VariationalStepper;
+
+namespace border {
+
+// The inner loops for the number of joints of a mechanism; those for any number where none that is compiled fits.
+const Kernels& kernels_of(const Mechanism& mechanism);
+
+std::unique_ptr<VariationalStepper> constrained_stepper(const Mechanism& mechanism, const Tableau& tableau,
+                                                        const std::vector<double>& places, double tolerance,
+                                                        const Guards& guards);
+
+}  // namespace border
+
+}  // namespace varpin
