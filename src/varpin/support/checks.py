@@ -58,9 +58,9 @@ def tuple_of(name: str, given: Any, kind: type, note: str = "") -> tuple[Any, ..
     Raises:
         InputError: ``given`` is neither, or one of the entries has another type.
     """
-    found = (given,) if isinstance(given, kind) else given
+    found = (given,) if isinstance(given, kind) and kind is not str else given
     if isinstance(found, str) or not isinstance(found, Sequence):
-        raise InputError(f"{name} must be a list of varpin's {name}, got {type(given).__name__}{note}")
+        raise InputError(f"{name} must be a list of varpin's {name}, got {reprlib.repr(given)}{note}")
     for item in found:
         if not isinstance(item, kind):
             raise InputError(f"{name} must be a list of varpin's {name}, got {item!r} in it{note}")
