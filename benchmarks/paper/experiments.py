@@ -5,7 +5,6 @@ Equation (O14) of docs/mathematics.md.
 
 from __future__ import annotations
 
-import json
 import logging
 import time
 from collections.abc import Callable, Iterator
@@ -229,10 +228,8 @@ class Store:
         if not path.is_file():
             return None
         try:
-            members = dict(read_npz(path))
-            if "facts" in members:  # written by varpin 0.1
-                members |= {name: np.asarray(value) for name, value in json.loads(str(members["facts"])).items()}
-            if str(members.get("version")) != __version__:
+            members = read_npz(path)
+            if str(np.asarray(members.get("version", ""))) != __version__:
                 return None
             return record_of(Cell, members, path)
         except (FileError, ValueError) as error:
