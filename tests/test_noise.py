@@ -138,7 +138,7 @@ def test_state_noise_is_centred_on_the_start_of_the_motion():
         (lambda: vp.ControlNoise(np.full((3, 1, 2), np.nan)), ("ControlNoise intensity[0, 0, 0]", "nan")),
         (lambda: vp.StateNoise([1.0, 0.0, np.nan]), ("StateNoise intensity[2]", "nan")),
         (lambda: vp.StateNoise(1.0, center=[0.0, np.inf, 0.0]), ("StateNoise center[1]", "inf")),
-        (lambda: 3.0, ("noise", "float")),
+        (lambda: 3.0, ("noise", "3.0")),
         (lambda: [vp.AdditiveNoise(1.0), 0.5], ("noise", "0.5")),
         (lambda: vp.AdditiveNoise(1.0) + vp.StateNoise(np.ones(4)), "StateNoise intensity"),
         (lambda: vp.CustomNoise(lambda q, v, u: np.eye(3), 3.0), ("CustomNoise processes", "3.0")),
