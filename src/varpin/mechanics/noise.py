@@ -279,7 +279,7 @@ class CustomNoise(Noise):
         return BoundNoise(_noise(n, m, self.processes).arrays, ((0, self),))
 
     def at(self, name: str, points: Sequence[tuple[Floats, Floats, Floats]], shape: tuple[int, ...]) -> Floats:
-        """Values (N, *shape) of one of the functions at N points (q, v, u); 0 for a function that is left out.
+        """Values (N, ...) of one of the functions at N points (q, v, u); 0 for a function that is left out.
 
         Raises:
             NoiseFieldError: It raised, or its result is not a finite array of this shape.
