@@ -209,6 +209,12 @@ def test_what_friction_lets_a_motion_do_is_linearized():
         assert np.isfinite(vp.linearize(scene, motion).A).all()
 
 
+@pytest.mark.parametrize("force", [vp.JointSpring, vp.JointDamper, vp.PositionServo, vp.CoulombFriction, vp.Armature])
+def test_a_force_without_its_number_is_refused(force):
+    with refused(vp.InputError, "None"):
+        vp.Scene(vp.planar_chain(2), forces=force(None))
+
+
 def test_stops_ends_and_servos_are_said():
     chain = vp.planar_chain(2)
     with refused(vp.InputError, "'joint1'", "'joint2'", "lower", "upper"):

@@ -25,7 +25,7 @@ from varpin.support.differences import slopes
 from varpin.trajectory import Trajectory
 
 # Difference of the end of a step from the recorded one, as a share of its change of velocity: rounding.
-_SAME = 1e-5
+_SAME, _OF_SPEED = 1e-5, 1e-8
 # Rates of damping, times the step, from which the stationary variance of a damped velocity is wrong by a tenth: where
 # the whole impulse precedes the step, and where it is held over the step or split.
 _BEFORE, _WITHIN = 0.1, 1.1
@@ -408,10 +408,8 @@ def _require_first_step(scene: Scene, trajectory: Trajectory, integrator: Integr
     state, _ = integrator.start(scene, first.q[:1].copy(), first.v[:1].copy())
     drawn = first.dw[None] if trajectory.noisy else first.dw[None, :0][:0]
     (again,) = integrator.rollout(scene, state, commands, drawn, first.dt)
-    if (
-        again.failure is not None
-        or np.abs(again.v[0] - first.v[1]).max() > _SAME * np.abs(np.diff(first.v, axis=0)).max()
-    ):
+    off, change = np.abs(again.v[0] - first.v[1]).max(), np.abs(np.diff(first.v, axis=0)).max()
+    if again.failure is not None or not off <= _SAME * change + _OF_SPEED * np.abs(first.v).max():
         raise InputError("the trajectory was made in another scene than the one given: its first step differs")
 
 

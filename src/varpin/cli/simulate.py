@@ -83,8 +83,10 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
     integrator = None if request.integrator is None else integrator_of_words(request.integrator)
     scene, q0, v0, torque = motion_of(request)
     wish = {name: getattr(request, name) for name in ("dt", "steps", "duration", "tolerance")}
-    if request.tolerance is None:
-        wish["dt"] = DT if request.dt is None else positive("--dt", request.dt, "s")
+    if request.dt is not None:
+        positive("--dt", request.dt, "s")
+    elif request.tolerance is None:
+        wish["dt"] = DT
     if request.steps is None and request.duration is None:
         dt = wish["dt"]
         # The default of the duration gives way to the step.

@@ -121,16 +121,16 @@ def _starts_outside(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Goals and targets that their frame cannot reach."""
-    robot, places = problem.scene.robot, {}
+    robot, places = problem.scene.robot, []
     for term in problem.cost.terms:
         if isinstance(term, FramePositionCost) and not callable(term.target):
             strengths, axes = np.linalg.eigh(weight_matrix("FramePositionCost", term.weight, 3))
             weighed = axes[:, strengths > _SAME * strengths[-1]]
-            places[f"FramePositionCost({term.frame!r})"] = term.frame, weighed, np.asarray(term.target)
+            places.append((f"FramePositionCost({term.frame!r})", term.frame, weighed, np.asarray(term.target)))
     for goal in problem.constraints:
         if isinstance(goal, ReachFrame) and goal.position is not None:
-            places[goal.label] = goal.frame, np.eye(3), goal.position
-    for label, (frame, axes, place) in places.items():
+            places.append((goal.label, goal.frame, np.eye(3), goal.position))
+    for label, frame, axes, place in places:
         kinematics = frame_kinematics(robot, frame)
         most, root = reach(robot, kinematics), kinematics.links.tree.translation[0]
         away = float(np.linalg.norm((np.atleast_2d(place) - root) @ axes, axis=1).max())

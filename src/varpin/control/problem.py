@@ -398,7 +398,7 @@ class OptimalControlProblem(Frozen):
     def setting(self) -> dict[str, Any]:
         """What tells the problem from others, costs aside: numbers and texts by name; noise in Python by its size.
 
-        Constraints are their values at the start at all nodes: a function of time may have no name.
+        Constraints are their values on a path from the start that turns all joints: functions of time have no names.
         """
         names = ("dt", "steps", "hold", "controls", "between_nodes", "sampling", "q0", "v0", "t0", "control_limits")
         found: dict[str, Any] = {name: getattr(self, name) for name in names}
@@ -410,7 +410,8 @@ class OptimalControlProblem(Frozen):
             "constraints": ", ".join(item.label for item in self.constraints),
             "integrator": repr(self.integrator),
         }
-        q, v = (np.tile(state, (self.steps + 1, 1)) for state in (self.q0, self.v0))
+        path = 0.1 * np.sin(np.outer(np.arange(self.steps + 1), 1.0 + np.arange(len(self.q0))))
+        q, v = self.q0 + path, self.v0 + path
         u = np.zeros((self.steps + self.linear, self.scene.controls))
         for i, bound in enumerate(self.bound_constraints):
             found[f"constraints.{i}"] = np.append(bound.value(q, v, u), bound.source.margin)

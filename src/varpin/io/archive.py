@@ -243,7 +243,9 @@ class _Builder:
         kinds = typing.get_args(hint)
         if isinstance(value, dict):
             # Records, by columns.
-            columns = {name: np.asarray(column).tolist() for name, column in value.items()}
+            columns = {name: np.atleast_1d(column).tolist() for name, column in value.items()}
+            if len(set(map(len, columns.values()))) > 1:
+                raise self.error(entry, "columns of different lengths", "a table")
             value = [dict(zip(columns, each, strict=True)) for each in zip(*columns.values(), strict=True)]
         if not isinstance(value, list) or (kinds[-1] is not ... and len(value) != len(kinds)):
             raise self.error(entry, reprlib.repr(value), "a list" if kinds[-1] is ... else f"a list of {len(kinds)}")

@@ -67,7 +67,6 @@ _OF_JOINTS = ("damping", "stiffness", "rest", "armature")
 _OFF, CORRECTED = 1e-6, 0.02
 # Rank tolerance of the constraint Jacobian, relative to its largest singular value.
 _RANK = 1e-9
-EARTH = (0.0, 0.0, -9.81)
 # Forces that act only if the scene has them, by their names in a report.
 _ABSENT: Mapping[str, type[Force]] = {"stops at joint limits": JointStop, "dry friction": CoulombFriction}
 # Depth to which a joint may press into a stop, in widths of the stop.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import logging
+import re
 import textwrap
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -139,9 +140,10 @@ def _read_wavefront(file: Path, content: bytes) -> list[MeshPart]:
         """The name of a file, which options may precede."""
         return words if is_file(file.parent / words) else words.rsplit(" ", maxsplit=1)[-1]
 
-    loaded = load_obj(
-        io.StringIO(content.decode("utf-8", errors="replace")), resolver=Beside(str(file), allow_anywhere=True)
-    )
+    text = content.decode("utf-8", errors="replace").replace("\\\n", " ")
+    if re.search(r"^[ \t]|^f.*-|^[fv].*#", text, re.MULTILINE):
+        text = _simplified(text)
+    loaded = load_obj(io.StringIO(text), resolver=Beside(str(file), allow_anywhere=True))
     parts = []
     for mesh in loaded.get("geometry", {}).values():
         visual, normals, colors = mesh.get("visual"), mesh.get("vertex_normals"), mesh.get("vertex_colors")

@@ -364,7 +364,8 @@ def _cure(
     """What reduces an error that exceeds its threshold by a factor ``excess``; laws and policies keep their periods."""
     q, v, most = trajectory.q, trajectory.v, _RINGS / trajectory.dt
     contact = contact_rate(scene, q, v, trajectory.dt)
-    damped_by_others = not (integrator.l_stable or scene.constraints or contact > most)
+    # Radau damps what noise excites, too.
+    damped_by_others = not (integrator.l_stable or scene.constraints or contact > most or trajectory.noisy)
     if damped_by_others and fastest_rate(scene, q, v, trajectory.u, most) > 0.0:
         return "Damping or friction is faster than the step: use integrator=varpin.Radau(4)"
     if isinstance(integrator, Reference):
@@ -384,7 +385,7 @@ def _cure(
     if contact > most:
         return f"Stops are stiffer than the step resolves. Use {smaller}"
     fed = isinstance(controls, LinearPolicy) and not integrator.variational
-    if fed or stages > MOST_STAGES or not (scene.smooth or not scene.elements):
+    if fed or trajectory.noisy or stages > MOST_STAGES or not (scene.smooth or not scene.elements):
         return f"Use {smaller}"
     other = f"integrator=varpin.{'Radau' if integrator.l_stable else 'Gauss'}({stages})"
     # Of a low order smaller steps take too many, and errors as large as the motion tell no more how many.

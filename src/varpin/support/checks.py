@@ -6,7 +6,7 @@ import inspect
 import math
 import os
 import reprlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from numbers import Real
 from pathlib import Path
@@ -59,12 +59,14 @@ def tuple_of(name: str, given: Any, kind: type, note: str = "") -> tuple[Any, ..
         InputError: ``given`` is neither, or one of the entries has another type.
     """
     found = (given,) if isinstance(given, kind) and kind is not str else given
-    if isinstance(found, str) or not isinstance(found, Sequence):
-        raise InputError(f"{name} must be a list of varpin's {name}, got {reprlib.repr(given)}{note}")
-    for item in found:
+    wanted = f"{name} must be a list" if kind is str else f"{name} must be a list of varpin's {name}"
+    if isinstance(found, str) or not isinstance(found, Iterable):
+        raise InputError(f"{wanted}, got {reprlib.repr(given)}{note}")
+    items = tuple(found)
+    for item in items:
         if not isinstance(item, kind):
-            raise InputError(f"{name} must be a list of varpin's {name}, got {item!r} in it{note}")
-    return tuple(found)
+            raise InputError(f"{wanted}, got {item!r} in it{note}")
+    return items
 
 
 def broadcast_array(name: str, value: object, size: int, *, limit: bool = False) -> Floats:
