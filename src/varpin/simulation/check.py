@@ -384,8 +384,9 @@ def _cure(
         smaller += f" with hold={controls.hold * parts} in the policy"
     if contact > most:
         return f"Stops are stiffer than the step resolves. Use {smaller}"
-    fed = isinstance(controls, LinearPolicy) and not integrator.variational
-    if fed or trajectory.noisy or stages > MOST_STAGES or not (scene.smooth or not scene.elements):
+    kept = isinstance(controls, LinearPolicy) and not integrator.variational
+    kept |= trajectory.noisy and integrator.l_stable
+    if kept or stages > MOST_STAGES or not (scene.smooth or not scene.elements):
         return f"Use {smaller}"
     other = f"integrator=varpin.{'Radau' if integrator.l_stable else 'Gauss'}({stages})"
     # Of a low order smaller steps take too many, and errors as large as the motion tell no more how many.
