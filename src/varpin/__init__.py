@@ -178,33 +178,133 @@ if TYPE_CHECKING:
     from varpin.study.precision import work_precision as work_precision
     from varpin.study.record import StudyInterrupted as StudyInterrupted
 
+# The names of the block above by their modules, which are imported with the first use of a name.
+_LATE = {
+    "varpin.control": (
+        "ConstraintReport",
+        "Iteration",
+        "MonteCarlo",
+        "MonteCarloInterrupted",
+        "Multipliers",
+        "OptimalControlProblem",
+        "Refined",
+        "Refinement",
+        "SearchState",
+        "Solution",
+        "Status",
+        "Verification",
+        "ViolationOnRobot",
+        "solve",
+    ),
+    "varpin.control.constraints": (
+        "KeepClear",
+        "KeepInBox",
+        "KeepInHalfSpace",
+        "KeepInSphere",
+        "KeepOutOfSphere",
+        "PlanConstraint",
+        "ReachFrame",
+        "WithinControlRate",
+        "WithinJointLimits",
+        "WithinVelocityLimits",
+    ),
+    "varpin.control.costs": (
+        "BoundCost",
+        "CenterOfMassCost",
+        "ControlCost",
+        "ControlRateCost",
+        "Cost",
+        "CostError",
+        "CustomCost",
+        "Expansion",
+        "FrameOrientationCost",
+        "FramePositionCost",
+        "FrameVelocityCost",
+        "JointLimitBarrier",
+        "ManipulabilityCost",
+        "Points",
+        "Terminal",
+        "TrackingCost",
+        "VelocityCost",
+        "VelocityLimitBarrier",
+    ),
+    "varpin.control.mpc": (
+        "Mpc",
+        "MpcRun",
+        "Plant",
+    ),
+    "varpin.ensemble": (
+        "Ensemble",
+        "EnsembleInterrupted",
+        "EnsembleStatistics",
+        "PathFailure",
+        "simulate_ensemble",
+    ),
+    "varpin.io.scenefile": (
+        "SceneFile",
+        "SceneFileError",
+        "load_scene",
+    ),
+    "varpin.linearization": (
+        "Curvature",
+        "Linearization",
+        "Moments",
+        "linearize",
+        "propagate_moments",
+        "second_order",
+    ),
+    "varpin.model.clearance": ("Obstacle",),
+    "varpin.show.inspection": (
+        "FrameReport",
+        "JointReport",
+        "LinkReport",
+        "RobotReport",
+        "inspect_robot",
+    ),
+    "varpin.show.replay.live": ("LiveView",),
+    "varpin.show.replay.motion": ("replay",),
+    "varpin.study.advice": (
+        "Advice",
+        "Choice",
+        "advise",
+    ),
+    "varpin.study.extremes": ("check_robot",),
+    "varpin.study.linearization_check": (
+        "LinearizationCheck",
+        "check_linearization",
+    ),
+    "varpin.study.plans": (
+        "OptimalControlRun",
+        "OptimalControlTradeoff",
+        "optimal_control_tradeoff",
+    ),
+    "varpin.study.precision": (
+        "WorkPrecision",
+        "WorkPrecisionRun",
+        "work_precision",
+    ),
+    "varpin.study.record": ("StudyInterrupted",),
+}
+
 # Submodules that a user takes from the top level.
 _MODULES = {"plots": "varpin.show.plots", "wiener": "varpin.mechanics.wiener"}
 
 
 if not TYPE_CHECKING:
     # What a simulation has no need of is imported with its first use: all of it at once takes as long as Pinocchio.
-    import ast as _ast
-    import functools as _functools
-
-    @_functools.cache
-    def _late() -> dict[str, str]:
-        """The module of each name that the block for type checkers above imports."""
-        source = _ast.parse(__spec__.loader.get_source(__name__))
-        (block,) = (item for item in source.body if isinstance(item, _ast.If) and isinstance(item.test, _ast.Name))
-        return {name.asname: item.module for item in block.body for name in item.names}
+    _MODULE_OF = {name: module for module, names in _LATE.items() for name in names}
 
     def __getattr__(name: str) -> object:
         from importlib import import_module  # noqa: PLC0415 - no public name
 
         if name in _MODULES:
             found = import_module(_MODULES[name])
-        elif name in _late():
-            found = getattr(import_module(_late()[name]), name)
+        elif name in _MODULE_OF:
+            found = getattr(import_module(_MODULE_OF[name]), name)
         else:
             raise AttributeError(f"module 'varpin' has no attribute {name!r}")
         globals()[name] = found
         return found
 
     def __dir__() -> list[str]:
-        return sorted({*globals(), *_late(), *_MODULES} - {"TYPE_CHECKING"})
+        return sorted({*globals(), *_MODULE_OF, *_MODULES} - {"TYPE_CHECKING"})
