@@ -305,8 +305,8 @@ class Search:
         if self._has_goals:
             self.plan = self._pass_to_goals() or plan
         if len(self.history) < self.since:
-            most = 0.0 if self.step is not None and self.step.elastic else _GROWS
-            self.backoff = [a + np.minimum(b - a, most * b) for a, b in self._margins_and(self.plan)]
+            elastic = self.step is not None and self.step.elastic
+            self._move_margins([move for move, _ in self._margin_moves(self.plan, grow=not elastic)])
         # The step is the pass's own, where that keeps to all limits and rows.
         plain = self.regularization == 0.0 and not self._has_goals
         free = not self.bound and (not problem.limited or self._is_free(plan, ()))
@@ -423,11 +423,13 @@ class Search:
         """The first iteration from which on rows and margins stay, as rows are new: margins follow the motion first."""
         return len(self.history) + (_FOLLOWING if self._has_margins and not self.tick else 0)
 
-    def _margins_and(self, plan: Plan) -> list[tuple[Floats, Floats]]:
-        """Margins of all rows, in their units, as they are used and of the motion.
+    def _margin_moves(self, plan: Plan, *, grow: bool) -> list[tuple[Floats, Floats]]:
+        """The moves of the margins of all rows towards those of a motion, and these, in the rows' units.
 
-        The latter are standard deviations under the plan's feedback, and what is added.
+        The latter are standard deviations under the plan's feedback, and what is added. After each round the moves are
+        a smaller part of the way: a motion far from its rows has small margins, which let it come near again.
         """
+        share, most = 1.0 / (1.0 + self.rounds), _GROWS if grow else 0.0
         kept = [item for item in self.bound if item.source.margin > 0.0]
         spreads = iter(deviations(self.along, Feedback(plan.feedback, plan.previous), kept))
         more = [np.zeros(1)] * len(self.bound)
@@ -436,9 +438,12 @@ class Search:
         found = []
         for item, used, extra in zip(self.bound, self.backoff, more, strict=True):
             own = item.source.margin * next(spreads) if item.source.margin > 0.0 else np.zeros(item.shape)
-            there = item.in_force if isinstance(item, BoundBetween) else True
-            found.append((used, np.where(there, own + extra, 0.0)))
+            own = np.where(item.in_force if isinstance(item, BoundBetween) else True, own + extra, 0.0)
+            found.append((np.minimum(share * (own - used), most * own), own))
         return found
+
+    def _move_margins(self, moves: Sequence[Floats]) -> None:
+        self.backoff = [used + move for used, move in zip(self.backoff, moves, strict=True)]
 
     def _ended(self, tolerance: float) -> Status | None:
         """The status of a search whose step gains no more than the tolerance; None if it goes on."""
@@ -539,16 +544,13 @@ class Search:
         """
         if self.plan is None or not self._has_margins or self.rounds >= _ROUNDS:
             return False
-        pairs = self._margins_and(self.plan)
-        # Each time a smaller part of the way: a motion far from its rows has small margins, which let it come near
-        # again. What cannot be met is violent, and does not widen margins.
-        share, most = 1.0 / (1.0 + self.rounds), 0.0 if ended is Status.INFEASIBLE else _GROWS
-        moves = [np.minimum(share * (b - a), most * b) for a, b in pairs]
-        if all((np.abs(move) <= _MOVES * b.max(axis=0)).all() for move, (_, b) in zip(moves, pairs, strict=True)):
+        # What cannot be met is violent, and does not widen margins.
+        moves = self._margin_moves(self.plan, grow=ended is not Status.INFEASIBLE)
+        if all((np.abs(move) <= _MOVES * own.max(axis=0)).all() for move, own in moves):
             return False
         if len(self.history) >= self.since:
             self.since, self.rounds = len(self.history), self.rounds + 1
-        self.backoff = [a + move for move, (a, _) in zip(moves, pairs, strict=True)]
+        self._move_margins([move for move, _ in moves])
         return True
 
     def _line_search(self) -> Taken:

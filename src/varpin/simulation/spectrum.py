@@ -59,9 +59,10 @@ def fastest_damping(scene: Scene, q: Floats, v: Floats, forces: Floats, least: f
     M, D = masses(scene, q), damping_matrices(scene, q, v, forces, custom=True)
     if _definite(least * M - D):
         return 0.0
-    if not _definite(M):
+    try:
+        root = np.linalg.cholesky(M)
+    except np.linalg.LinAlgError:
         return math.inf
-    root = np.linalg.cholesky(M)
     white = np.linalg.solve(root, np.swapaxes(np.linalg.solve(root, D), 1, 2))
     return float(np.linalg.eigvalsh(white).max())
 
