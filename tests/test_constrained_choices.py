@@ -87,8 +87,6 @@ def test_work_and_precision_under_constraints():
     assert record.reference_error < 1e-12
     coarse, fine = (run for run in record.runs if run.order == 2)
     assert np.log2(coarse.error / fine.error) == pytest.approx(2.0, abs=0.3)
-    with refused(vp.InputError, "reference="):
-        vp.work_precision(scene, q, v, duration=0.4, reference=vp.Reference())
     with refused(vp.InputError, "RungeKutta4", "constraints"):
         vp.work_precision(scene, q, v, duration=0.4, integrators=[vp.RungeKutta4()])
 

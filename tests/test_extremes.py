@@ -70,9 +70,8 @@ def test_a_sound_motion_passes_every_check():
     found = checks.measures(setup.scene, vp.Midpoint(), motion, exact_motion(setup, 1e-2, 100, 0.3))
     assert found.keys() == LEVELS.keys()
     assert not any(math.isnan(value) for value in found.values())
-    assert checks.findings(found, vp.Midpoint()) == ()
+    assert checks.findings(found) == ()
     assert found["error"] < 1e-2
-    assert found["momentum"] < 1e-12
     assert found["symplecticity"] < 1e-13
 
 
@@ -97,26 +96,25 @@ def drifting(motion):
         # Pinocchio knows better what energies and momenta are.
         (True, leaking, {"energy", "record"}),
         (True, overflowing, {"energy"}),
-        (False, drifting, {"momentum", "record"}),
+        (False, drifting, {"record"}),
     ],
 )
 def test_records_that_are_made_up_are_found(gravity, fault, broken):
     setup, motion = falling(gravity=gravity)
     own = {
         "energy": lambda m: checks.energy_error(setup.scene, m),
-        "momentum": lambda m: checks.momentum_error(setup.scene, m),
         "record": lambda m: checks.record_error(setup.scene, m),
     }
 
     def names(m):
         measured = {name: measure(m) for name, measure in own.items()}
-        return {text.split()[0] for text in checks.findings(measured, vp.Midpoint())}
+        return {text.split()[0] for text in checks.findings(measured)}
 
     assert names(motion) == set()
     assert names(tampered(motion, **fault(motion))) == broken
 
 
-def test_a_wrong_root_is_found_by_the_reference_and_by_reversal():
+def test_a_wrong_root_is_found_by_the_reference():
     # Another root of the step equation of a rod: it goes the long way round, and every record of it is consistent.
     setup, motion = falling()
     turn = np.zeros_like(motion.q)
@@ -126,9 +124,6 @@ def test_a_wrong_root_is_found_by_the_reference_and_by_reversal():
     assert len(exact.nodes) > 20
     assert exact.errors(motion)["error"] < 1e-2
     assert exact.errors(tampered(motion, q=q))["error"] > LEVELS["error"]
-    jumped = tampered(motion.part(0, 44), q=q[:45])
-    assert checks.reversal_error(setup.scene, vp.Midpoint(), motion) < 1e-9
-    assert checks.reversal_error(setup.scene, vp.Midpoint(), jumped) > LEVELS["reversal"]
 
 
 def test_a_map_that_is_not_symplectic_is_found():

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import math
-import time
 from collections.abc import Iterator, Sequence
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cache, partial
 
 from battery.exact import exact_motion, period_error
 from battery.scenes import TRIALS, trials_on
-from battery.trial import Outcome, Setup, Trial
+from battery.trial import Setup, Trial
 from varpin.integrators import Integrator
 from varpin.model import Robot
 from varpin.study import checks
-from varpin.study.checks import LEVELS, condition, findings
 from varpin.study.exact import Exact, before_step
-from varpin.study.extremes import INTEGRATORS, Cell, Kind, Record, attempt, judge
+from varpin.study.extremes import INTEGRATORS, Cell, Motion, Record, cell
 from varpin.study.record import Progress, collect
 from varpin.support.checks import positive
+from varpin.trajectory import Trajectory
 
 # A motion gets this long, and the plain battery half a minute at most for one [s].
 _PATIENCE, _DEEP_PATIENCE = 20.0, 900.0
@@ -55,63 +54,32 @@ def run(
 
     def cells() -> Iterator[Cell]:
         for trial in trials:
-            bench = Bench(trial)
+            build = cache(partial(Bench.of, trial))
             for member in members:
-                yield bench.run(member, limit)
+                yield cell(trial.name, build, member, limit)
 
     name = "the battery" if robot is None else robot.name
     return collect(Record((), name), cells(), len(trials) * len(members), progress)
 
 
-class Bench:
-    """A trial with what all integrators share of it: its setup and its exact motion."""
+@dataclass(frozen=True, eq=False)
+class Bench(Motion):
+    """The motion of a trial; its exact motion is in closed form where there is one, and it is compared all over."""
 
-    def __init__(self, trial: Trial) -> None:
-        self.trial = trial
-        self._exact: dict[float | None, Exact | None] = {}
+    setup: Setup
+    known: dict[float | None, Exact | None] = field(default_factory=dict)
 
-    def run(self, integrator: Integrator, patience: float) -> Cell:
-        """The trial with one integrator."""
-        trial, begin = self.trial, time.perf_counter()
-        try:
-            outcome = self._judge_motion(trial, integrator, patience)
-        except Exception as error:
-            outcome = Outcome.of_error(error, Kind.REFUSED)
-        return Cell(
-            trial=trial.name,
-            integrator=str(integrator),
-            kind=outcome.kind,
-            said=outcome.said,
-            found=outcome.found,
-            done=outcome.done,
-            steps=trial.steps,
-            seconds=round(time.perf_counter() - begin, 3),
-            **dict.fromkeys(LEVELS, math.nan) | outcome.measures,
-        )
+    @classmethod
+    def of(cls, trial: Trial) -> Bench:
+        """A trial; may raise varpin's refusal of it."""
+        setup = trial.build()
+        state = setup.scene, setup.q0, setup.v0, setup.controls, setup.increments, setup.shift
+        return cls(trial.name, trial.dt, trial.steps, *state, trial.window, setup)
 
-    @cached_property
-    def _setup(self) -> Setup:
-        return self.trial.build()
-
-    def _judge_motion(self, trial: Trial, integrator: Integrator, patience: float) -> Outcome:
-        setup = self._setup
-        trajectory, error = attempt(
-            patience, setup.scene, setup.q0, setup.v0, dt=trial.dt, steps=trial.steps,
-            controls=setup.controls, increments=setup.increments, integrator=integrator,
-        )  # fmt: skip
-        exact, scene = self._exact_motion(trial, integrator), setup.scene
-        found, period = (
-            checks.measures(scene, integrator, trajectory, exact),
-            period_error(scene, integrator, trajectory),
-        )
-        late = (f"period {period:.2g} (wrong from 1)",) if period >= 1.0 else ()
-        wrong = (*findings(found, integrator, condition(scene, setup.q0)), *late)
-        kind, said, wrong = judge(trajectory, error, wrong)
-        return Outcome(kind, found, said, wrong, trajectory.steps)
-
-    def _exact_motion(self, trial: Trial, integrator: Integrator) -> Exact | None:
-        """The exact motion, computed once; None where even that cannot be integrated."""
-        left = 1.0 if self._setup.increments is None else before_step(integrator)
-        if left not in self._exact:
-            self._exact[left] = exact_motion(self._setup, trial.dt, trial.steps, trial.window, left=left)
-        return self._exact[left]
+    def measures(self, integrator: Integrator, trajectory: Trajectory) -> dict[str, float]:
+        """And the error from nodes all over, in units of what is wrong."""
+        left = 1.0 if self.increments is None else before_step(integrator)
+        if left not in self.known:
+            self.known[left] = exact_motion(self.setup, self.dt, self.steps, self.window, left=left)
+        found = checks.measures(self.scene, integrator, trajectory, self.known[left])
+        return found | {"period": period_error(self.scene, integrator, trajectory)}

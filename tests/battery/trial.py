@@ -1,16 +1,14 @@
-"""A scene at an extreme, and the judgement of what came of it with one integrator."""
+"""A scene at an extreme."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.errors import VarpinError
 from varpin.mechanics.scene import Scene
-from varpin.study.extremes import Kind, line_of
 
 Floats = NDArray[np.float64]
 
@@ -64,21 +62,3 @@ class Trial:
     steps: int
     window: float = 1.0
     deep: bool = False
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The judgement of a motion: a part of a :class:`Cell`, and its measures by name as far as they apply."""
-
-    kind: Kind
-    measures: dict[str, float] = field(default_factory=dict)
-    said: tuple[str, ...] = ()
-    found: tuple[str, ...] = ()
-    done: int = 0
-
-    @classmethod
-    def of_error(cls, error: Exception, kind: Kind, done: int = 0) -> Outcome:
-        """A refusal or a stop where the error is varpin's own; any other error is a fault of varpin's."""
-        if isinstance(error, VarpinError):
-            return cls(kind, said=(line_of(error),), done=done)
-        return cls(Kind.WRONG, found=(f"unnamed error: {type(error).__name__}: {error}",))

@@ -633,13 +633,13 @@ def _numbers_of(rows: ConstraintRows) -> dict[str, Floats]:
     return found
 
 
-def refuse_constraints(
-    scene: Scene, what: object, instead: str = "motions and plans do, with varpin.Midpoint() or varpin.Gauss(stages)"
-) -> None:
-    """Refuse a scene with constraints in ``what``; the message ends with the alternative ``instead``."""
+def refuse_constraints(scene: Scene, what: object) -> None:
+    """Refuse a scene with constraints in ``what``."""
     if scene.constraints:
-        names = scene.terms["constraints"]
-        raise InputError(f"{what} does not take scenes with constraints, and this one has {names}: {instead}")
+        raise InputError(
+            f"{what} does not take scenes with constraints, and this one has {scene.terms['constraints']}: motions and "
+            "plans do, with varpin.Midpoint() or varpin.Gauss(stages)"
+        )
 
 
 def closest_controls(scene: Scene, q: Floats) -> Floats:

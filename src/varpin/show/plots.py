@@ -208,10 +208,10 @@ def _share_legend(figure: Figure, panels: NDArray[Any]) -> None:
 def plot_study(study: Study[Any], axes: Axes | None = None, **options: str) -> tuple[Figure | SubFigure, Axes]:
     """What a study measured over time: a line for each method, circles and a line on the Pareto front.
 
-    A grey line marks the error of the reference, or the tolerance or budget that was asked for.
+    A grey line marks the error of the reference.
 
     Args:
-        study: From :func:`varpin.work_precision`, :func:`varpin.advise` or :func:`varpin.optimal_control_tradeoff`.
+        study: From :func:`varpin.work_precision` or :func:`varpin.optimal_control_tradeoff`.
         axes: Where to draw; a new figure if left out.
         options: For work and precision ``quantity``: ``"q"``, the largest error in q over the motion, or ``"energy"``,
             that of the energy of a conservative motion. Errors below that of the reference are drawn on its line.
@@ -223,8 +223,7 @@ def plot_study(study: Study[Any], axes: Axes | None = None, **options: str) -> t
         InputError: Another ``study`` or ``quantity``, or no run has such a value.
     """
     if not hasattr(study, "chart"):
-        what = "varpin.work_precision, advise or optimal_control_tradeoff"
-        raise InputError(f"this figure is of a study, from {what}, got {type(study).__name__}")
+        raise InputError(f"this figure is of a study, as from varpin.work_precision, got {type(study).__name__}")
     chart = study.chart(**options)
     if not chart.front:
         raise InputError("no run has such a value, so there is nothing to plot")
@@ -237,7 +236,7 @@ def plot_study(study: Study[Any], axes: Axes | None = None, **options: str) -> t
     axes.plot(*zip(*chart.front, strict=True), linestyle="none", **ring)
     # The line connects only the points whose error is below that of all faster ones.
     front = [point for k, point in enumerate(chart.front) if all(point[1] < v for _, v in chart.front[:k])]
-    axes.plot(*zip(*front, strict=True), label=chart.standing, linewidth=0.8, **ring)
+    axes.plot(*zip(*front, strict=True), label="Pareto front", linewidth=0.8, **ring)
     axes.set(xscale="log", yscale="log" if chart.logarithmic else "linear")
     for name, (axis, value) in chart.marks.items():
         (axes.axvline if axis == "x" else axes.axhline)(value, label=name, **_MARK)

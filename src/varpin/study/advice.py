@@ -16,7 +16,7 @@ from varpin.integrators import Integrator, Reference
 from varpin.mechanics.scene import Scene
 from varpin.simulation.tolerance import Ladder, Trial, first_steps
 from varpin.study.motion import Setting, integrators_of
-from varpin.study.record import Chart, Study
+from varpin.study.record import Study
 from varpin.support.checks import JointValues, positive
 
 # Total time of the repetitions of a short run [s], and their largest number.
@@ -89,19 +89,6 @@ class Advice(Study[Choice]):
     def pareto(self) -> tuple[Choice, ...]:
         """The choice, if it meets the wish."""
         return (self.best,) if self.reached else ()
-
-    def chart(self) -> Chart:
-        """Predicted error over predicted time, and what was asked for."""
-        known = [run for run in self.runs if math.isfinite(run.error) and run.error > 0.0]
-        points = [(f"{run.integrator}, {run.dt:.3g} s", run.seconds, run.error) for run in known]
-        wishes = {"tolerance": ("y", self.tolerance), "budget": ("x", self.budget)}
-        return Chart(
-            points,
-            [(seconds, error) for _, seconds, error in points[:1]],
-            ("predicted wall time [s]", "error in q [rad or m]"),
-            "advised" if math.isfinite(self.best.error) else "the most accurate",
-            {name: (axis, value) for name, (axis, value) in wishes.items() if value is not None},
-        )
 
     @property
     def best(self) -> Choice:

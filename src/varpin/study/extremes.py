@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from enum import Enum
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -65,11 +66,6 @@ class Kind(Enum):
             Kind.WRONG: "a check fails, and varpin gives no warning",
         }[self]
 
-    @property
-    def letter(self) -> str:
-        """Its letter in tables."""
-        return "W" if self is Kind.WRONG else self.value[0].upper()
-
 
 @dataclass(frozen=True)
 class Cell:
@@ -83,8 +79,6 @@ class Cell:
         joint: The same distance, each joint in units of its own travel.
         velocity: The same of v, in units of each joint's largest velocity.
         energy: Largest error of the energy balance, in units of the energy there is to turn over.
-        momentum: Largest change of the momentum that is to be conserved, in units of the largest one.
-        reversal: Distance in q from where the reversed motion is to end, as a share of the joint travel.
         symplecticity: Largest entry of A' J A - J, in units of the sum of magnitudes that cancel in it.
         record: Largest distance of recorded momenta and energies from Pinocchio's, in their own units.
         said: varpin's warnings, or its error.
@@ -101,8 +95,6 @@ class Cell:
     joint: float
     velocity: float
     energy: float
-    momentum: float
-    reversal: float
     symplecticity: float
     record: float
     said: tuple[str, ...]
@@ -162,7 +154,7 @@ class Record(Study[Cell]):
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A motion that is hard to integrate, with controls (N, m) and increments (N, k) [s^0.5] or None.
+    """A motion that is hard to integrate, with controls (N, m) or (m,) and increments (N, k) [s^0.5], or None.
 
     It does not depend on the whole turns in q0 that it is ``ahead`` (n,) [rad]; a window [s] of it is compared.
     """
@@ -175,8 +167,15 @@ class Motion:
     v0: Floats
     controls: Floats | None
     increments: Floats | None
-    ahead: Floats
+    ahead: Floats | float
     window: float
+
+    def measures(self, integrator: Integrator, trajectory: Trajectory) -> dict[str, float]:
+        """The measures of what an integrator made of it."""
+        window, left = slice(max(1, round(self.window / self.dt))), before_step(integrator)
+        u, dw = trajectory.u[window], trajectory.dw[window]
+        exact = exact_motion(self.scene, self.q0, self.v0, u, dw, dt=self.dt, left=left, ahead=self.ahead)
+        return measures(self.scene, integrator, trajectory, exact)
 
 
 def motions_of(robot: Robot) -> list[Motion]:
@@ -266,15 +265,19 @@ def check_robot(
     limit = positive("patience", patience, "s")
     members = INTEGRATORS if integrators is None else integrators
     jobs = [(motion, member) for motion in motions_of(arm) for member in members]
-    return collect(Record((), arm.name), (_cell(*job, limit) for job in jobs), len(jobs), progress)
+    cells = (cell(motion.name, partial(replace, motion), member, limit) for motion, member in jobs)
+    return collect(Record((), arm.name), cells, len(jobs), progress)
 
 
-def _cell(motion: Motion, integrator: Integrator, patience: float) -> Cell:
-    scene, begin = motion.scene, time.perf_counter()
-    done, said, wrong, found = 0, (), (), {}  # type: int, tuple[str, ...], tuple[str, ...], dict[str, float]
+def cell(name: str, build: Callable[[], Motion], integrator: Integrator, patience: float) -> Cell:
+    """A motion with an integrator; errors of varpin refuse it, others are faults."""
+    begin, done, steps, said, wrong = time.perf_counter(), 0, 0, (), ()  # type: float, int, int, tuple[str, ...], tuple[str, ...]
+    found: dict[str, float] = {}
     try:
+        motion = build()
+        steps = motion.steps
         trajectory, error = attempt(
-            patience, scene, motion.q0, motion.v0, dt=motion.dt, steps=motion.steps,
+            patience, motion.scene, motion.q0, motion.v0, dt=motion.dt, steps=steps,
             controls=motion.controls, increments=motion.increments, integrator=integrator,
         )  # fmt: skip
     except VarpinError as refusal:
@@ -282,15 +285,12 @@ def _cell(motion: Motion, integrator: Integrator, patience: float) -> Cell:
     except Exception as fault:
         kind, wrong = Kind.WRONG, (f"unnamed error: {line_of(fault)}",)
     else:
-        window = slice(max(1, round(motion.window / motion.dt)))
-        u, dw, left = trajectory.u[window], trajectory.dw[window], before_step(integrator)
-        exact = exact_motion(scene, motion.q0, motion.v0, u, dw, dt=motion.dt, left=left, ahead=motion.ahead)
-        found, done = measures(scene, integrator, trajectory, exact), trajectory.steps
-        kind, said, wrong = judge(trajectory, error, findings(found, integrator, condition(scene, motion.q0)))
+        found, done = motion.measures(integrator, trajectory), trajectory.steps
+        kind, said, wrong = judge(trajectory, error, findings(found, condition(motion.scene, motion.q0)))
     return Cell(
-        trial=motion.name, integrator=str(integrator), kind=kind, said=said, found=wrong,
-        done=done, steps=motion.steps, seconds=round(time.perf_counter() - begin, 3),
-        **dict.fromkeys(LEVELS, math.nan) | found,
+        trial=name, integrator=str(integrator), kind=kind, said=said, found=wrong,
+        done=done, steps=steps, seconds=round(time.perf_counter() - begin, 3),
+        **dict.fromkeys(LEVELS, math.nan) | {name: found[name] for name in LEVELS if name in found},
     )  # fmt: skip
 
 

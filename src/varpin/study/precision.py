@@ -12,7 +12,7 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Gauss, Integrator, Reference
-from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
+from varpin.mechanics.scene import Scene, require_scene
 from varpin.simulation.check import repeated
 from varpin.simulation.tolerance import ROUNDING, SENSIBLE, Ladder, Trial, first_steps
 from varpin.study.motion import Setting, integrators_of
@@ -27,8 +27,8 @@ _COARSEST, _HALVINGS = 0.04, 8
 # Times at which motions are compared, at most; more if the controls change more often. A largest error is found to a
 # few per cent on motions of some ten oscillations.
 _SAMPLES = 64
-# Ratio of the reference's two tolerances: an error proportional to the tolerance differs by nine tenths of itself.
-_LOOSER = 10.0
+# The reference, and the one that tells its error.
+_EXACT, _LOOSER = Reference(rtol=1e-13), Reference(rtol=1e-12)
 # The reference under constraints, which ``Reference`` does not keep, and its most steps.
 _CONSTRAINED, _MOST = Gauss(4), 2**18
 
@@ -143,13 +143,13 @@ def work_precision(
     controls: JointValues | None = None,
     integrators: Sequence[Integrator] | None = None,
     dts: Sequence[float] | None = None,
-    reference: Reference | None = None,
     repeats: int = 3,
     progress: Progress | None = None,
 ) -> WorkPrecision:
     """Measure errors and wall times of integrators over steps, on one motion.
 
-    A run has one thread to itself. A run that fails is in the record with its reason, and the others go on.
+    Errors are against ``Reference(rtol=1e-13)``, or under constraints ``Gauss(4)`` in ever smaller steps. A run has one
+    thread to itself. A run that fails is in the record with its reason, and the others go on.
 
     Main args:
         scene: Without noise.
@@ -161,8 +161,6 @@ def work_precision(
         dts: Time steps [s], each rounded so that the controls' intervals hold whole numbers of steps.
 
     Other Args:
-        reference: The reference of the errors; its own error is estimated with another tolerance. Scenes with
-            constraints have ``Gauss(4)``, in steps that are reduced until nothing changes.
         repeats: Number of repetitions of each run; the fastest counts. Short runs have one more, which is not timed.
         progress: Called with (runs done, runs in all).
 
@@ -173,31 +171,24 @@ def work_precision(
     """
     setting = Setting.of(require_scene(scene), q0, v0, controls, duration)
     members, repeats = integrators_of(scene, integrators), count("repeats", repeats, least=1)
-    if reference is not None:
-        if not isinstance(reference, Reference):
-            raise InputError(f"reference must be a varpin.Reference, got {reference!r}")
-        refuse_constraints(scene, str(reference), "leave reference= out, for varpin.Gauss(4) in ever smaller steps")
-    elif not scene.constraints:
-        reference = Reference(rtol=1e-13)
     grids = _grids(setting, dts)
     jobs = [(member, steps) for member in members for steps in grids]
     samples = _samples(grids, len(setting.controls))
-    exact, other = _constrained(setting, samples) if reference is None else _by(setting, reference, samples)
-    text = f"{_CONSTRAINED} in ever smaller steps" if reference is None else str(reference)
+    if scene.constraints:
+        text, (exact, other) = f"{_CONSTRAINED} in ever smaller steps", _constrained(setting, samples)
+    else:
+        text, (exact, other) = str(_EXACT), [_by(setting, member, samples) for member in (_EXACT, _LOOSER)]
     error = float(np.abs(exact - other).max())
     base = WorkPrecision((), scene.robot.name, setting.duration, text, error, samples)
     return collect(base, (_measure(setting, exact, repeats, *job) for job in jobs), len(jobs), progress)
 
 
-def _by(setting: Setting, reference: Reference, samples: int) -> tuple[Floats, Floats]:
-    """The motion (K + 1, n) at a tolerance, and at one ten times looser."""
-    looser = Reference(rtol=_LOOSER * reference.rtol, atol=None if reference.atol is None else _LOOSER * reference.atol)
-    # Over short intervals both tolerances may take the same steps and agree, exact or not: halved they do not.
-    tight, loose = setting.run(reference, 2 * samples), setting.run(looser, samples)
-    for outcome in (tight, loose):
-        if outcome.failure:
-            raise VarpinError(f"the reference cannot integrate this motion: {outcome.failure}")
-    return tight.motion.q[::2], loose.motion.q
+def _by(setting: Setting, reference: Reference, samples: int) -> Floats:
+    """The motion (K + 1, n) of a reference."""
+    outcome = setting.run(reference, samples)
+    if outcome.failure:
+        raise VarpinError(f"the reference cannot integrate this motion: {outcome.failure}")
+    return outcome.motion.q
 
 
 def _constrained(setting: Setting, samples: int) -> tuple[Floats, Floats]:

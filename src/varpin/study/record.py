@@ -37,8 +37,7 @@ class Chart:
 
     Attributes:
         points: Method, wall time [s] and value of each run.
-        front: Wall time [s] and value of the runs that stand out.
-        standing: What these are.
+        front: Wall time [s] and value of the runs on the Pareto front.
         labels: Of the two axes.
         marks: Values to mark, by name: the axis, x or y, and the value.
         logarithmic: Whether the values are.
@@ -47,7 +46,6 @@ class Chart:
     points: Sequence[tuple[str, float, float]]
     front: Sequence[tuple[float, float]]
     labels: tuple[str, str]
-    standing: str = "Pareto front"
     marks: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     logarithmic: bool = True
 
