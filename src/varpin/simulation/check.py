@@ -36,6 +36,7 @@ from varpin.simulation.law import Law, law_of
 from varpin.simulation.limits import beyond_limits
 from varpin.simulation.spectrum import contact_rate, fastest_rate, speed_scales, travel_scales
 from varpin.simulation.start import finer
+from varpin.simulation.velocity_noise import wrong_spread
 from varpin.trajectory import Trajectory
 
 # Errors from which on a motion is told of: of q as a share of the largest travel of its kind, of v as a share of the
@@ -87,6 +88,8 @@ def check(
     function = controls if isinstance(controls, Sampled) else None
     extremes = None if function is None else function.whole.extremes
     limits = beyond_limits(scene, trajectory, extremes)
+    if trajectory.noisy:
+        limits = [*wrong_spread(scene, integrator, trajectory), *limits]
     if not trajectory.steps:
         known = np.zeros_like(trajectory.q)
     if known is not None:
