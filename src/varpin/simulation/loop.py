@@ -123,8 +123,8 @@ def _by_turns(scene: Scene, x: Floats, u: Floats, t: Floats, period: float) -> t
     if not left @ left < (1.0 - _FOLLOWS) * (len(at) - x.shape[1]) * side.var():
         return ()
     text = (
-        f"control {worst} turns back {len(at)} times in {len(u)} periods of {period:.4g} s: the law is too fast for its "
-        "period. Use a shorter period, or lower gains"
+        f"control {worst} turns back {len(at)} times in {len(u)} periods of {period:.4g} s: the law is too fast for "
+        "its period. Use a shorter period, or lower gains"
     )
     return _finding(scene, worst, text, float(len(at)), float(t[at[0] + 1]))
 
