@@ -34,9 +34,28 @@ _USUAL, _FAST, _CLOSED = RungeKutta4(), Radau(3), Gauss(stages=3)
 # Damping is fast if its rate times the plan's step is greater. Up to twice that, both integrators take as long.
 _FASTER = 8.0
 _READING = (
-    "where feedback loses less than a percent, the plan holds; where it loses more, dt is too coarse (controls alone "
-    "also lose much where a motion is unstable)"
+    "how to read it: where feedback loses less than a percent, the plan holds; where it loses more, dt is too coarse "
+    "(controls alone also lose much where a motion is unstable)"
 )
+
+
+class Played(NamedTuple):
+    """A motion under commands in parts of a plan's steps; all NaN where it diverges."""
+
+    cost: float
+    outside: list[Outside]  # by each constraint
+    nodes: Floats  # configurations at the plan's nodes
+
+
+class Outside(NamedTuple):
+    """The worst violation of a constraint by a motion, in the constraint's unit."""
+
+    worst: float = np.nan
+    time: float = np.nan
+    row: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.row} at t = {self.time:.4g} s" if self.worst > 0.0 else ""
 
 
 @dataclass(frozen=True)
@@ -51,6 +70,7 @@ class ViolationOnRobot:
             NaN where the motion diverges.
         closed_loop: The same with feedback.
         where: The worst row and time with feedback, in words; empty without violation or where the motion diverges.
+        range: The range of the constraint's values, in the same unit; 1 m or 3 rad for frames and clearance.
     """
 
     label: str
@@ -59,6 +79,12 @@ class ViolationOnRobot:
     open_loop: float
     closed_loop: float
     where: str
+    range: float = 1.0
+
+    @property
+    def share(self) -> float:
+        """The violation with feedback, relative to the range."""
+        return self.closed_loop / self.range
 
     def __str__(self) -> str:
         ways = [("planned", self.planned), ("controls alone", self.open_loop), ("with feedback", self.closed_loop)]
@@ -87,6 +113,7 @@ class Verification:
             the plan's step.
         constraints: Violations of the problem's constraints on the continuous system, without margins, at the nodes of
             the accurate integration from the plan's first one on. Rate limits of controls apply to decisions.
+        decided: Whether the substeps ended because the cost with feedback is surely greater than was asked for.
     """
 
     planned_cost: float
@@ -99,6 +126,7 @@ class Verification:
     accuracy: float
     integrator: str = str(_USUAL)
     constraints: tuple[ViolationOnRobot, ...] = ()
+    decided: bool = False
 
     @property
     def violation(self) -> float:
@@ -111,7 +139,7 @@ class Verification:
     @property
     def told(self) -> bool:
         """Whether the costs are known to a percent; if not, nothing can be concluded about the plan."""
-        return self.accuracy <= _UNKNOWN or self._diverges
+        return self.accuracy <= _UNKNOWN or self.decided or self._diverges
 
     @property
     def open_loop_loss(self) -> float:
@@ -125,25 +153,22 @@ class Verification:
 
     @property
     def _diverges(self) -> bool:
-        """Whether the motion diverges under the controls alone and with feedback."""
         return not np.isfinite([self.open_loop_cost, self.closed_loop_cost]).any()
 
     @property
     def _reading(self) -> str:
         """How to read the costs, or why they say nothing."""
         if self.told:
-            return f"how to read it: {_READING}"
-        how = "were compared with no others"
-        if np.isfinite(self.accuracy):
-            how = f"still change by {percent(self.accuracy)}, as something is too fast"
+            return _READING
+        changed = f", and still change by {percent(self.accuracy)}" if np.isfinite(self.accuracy) else ""
         return (
             f"these costs say nothing of the plan: those of {self.substeps} steps of {self.integrator} in one of the "
-            f"plan's {how}: give max_substeps of {2 * self.substeps} or more"
+            f"plan's are not known to a percent{changed}: give max_substeps of {2 * self.substeps} or more"
         )
 
     def _rows(self) -> list[tuple[str, str, str, str]]:
-        """The costs, losses and gaps of the plan and of both motions, by their names."""
-        rows = [("planned", f"{self.planned_cost:.6e}", "", "")]
+        """The costs, losses and gaps of the plan and of both motions, below their names."""
+        rows = [("", "cost", "loss", "end off by [rad or m]"), ("planned", f"{self.planned_cost:.6e}", "", "")]
         opened = ("controls alone", self.open_loop_cost, self.open_loop_loss, self.open_loop_gap)
         closed = ("with feedback", self.closed_loop_cost, self.closed_loop_loss, self.closed_loop_gap)
         for name, cost, loss, gap in (opened, closed):
@@ -153,22 +178,19 @@ class Verification:
 
     def _notes(self) -> list[str]:
         """What is below the table."""
-        good = "how good the costs are is not known"
+        good = "all motions run away" if self._diverges else "how good the costs are is not known"
         if np.isfinite(self.accuracy):
             good = f"costs are good to {self.accuracy:.0e} of themselves"
-        elif self._diverges:
-            good = "all motions run away"
         off = f"a step is off by {self.defect:.2e} rad or m at most; {good} ({self.substeps} substeps a step, "
         return [f"{off}{self.integrator})", self._reading, *map(str, self.constraints)]
 
     def _repr_html_(self) -> str:
-        head = ("", "cost", "loss", "end off by [rad or m]")
+        head, *rows = self._rows()
         notes = [("", note) for note in self._notes()]
-        return facts("Verification on the continuous system", notes, table(head, self._rows()))
+        return facts("Verification on the continuous system", notes, table(head, rows))
 
     def __str__(self) -> str:
-        rows = [("", "cost", "loss", "end off by [rad or m]"), *self._rows()]
-        lines = (f"{name:16}{cost:>14}{loss:>12}  {gap}".rstrip() for name, cost, loss, gap in rows)
+        lines = (f"{name:16}{cost:>14}{loss:>12}  {gap}".rstrip() for name, cost, loss, gap in self._rows())
         return "\n".join([*lines, *self._notes()])
 
 
@@ -193,150 +215,12 @@ def verify(
     policy: Policy,
     *,
     tolerance: float,
-    max_substeps: int,
-    progress: Callable[[int, int], None] | None,
-) -> Verification:
-    """Compare a plan, and its policy on (q, p) or (q, v), with accurate integrations: see :func:`on_robot`."""
-    found = on_robot(problem, plan, policy, tolerance=tolerance, max_substeps=max_substeps, progress=progress)
-    both = zip(_outside(problem, problem, plan), found.opened.outside, found.closed.outside, strict=True)
-    verified = Verification(
-        planned_cost=planned_cost,
-        open_loop_cost=found.opened.cost,
-        closed_loop_cost=found.closed.cost,
-        open_loop_gap=float(np.abs(found.opened.nodes[-1] - plan.q[-1]).max()),
-        closed_loop_gap=float(np.abs(found.closed.nodes[-1] - plan.q[-1]).max()),
-        defect=_defect(problem, plan, found.substeps, found.integrator),
-        substeps=found.substeps,
-        accuracy=found.accuracy,
-        integrator=str(found.integrator),
-        constraints=tuple(
-            ViolationOnRobot(
-                problem.label_of(own.bound.source), own.bound.unit, own.worst, alone.worst, fed.worst, fed.where
-            )
-            for own, alone, fed in both
-        ),
-    )
-    if not verified.told:
-        logger.warning("%s", verified._reading)
-    return verified
-
-
-class Outside(NamedTuple):
-    """The worst violation of a constraint by a motion."""
-
-    bound: BoundConstraint
-    worst: float = np.nan  # in the constraint's unit; NaN where the motion diverges
-    time: float = np.nan
-    row: str = ""
-
-    @property
-    def share(self) -> float:
-        """The violation relative to the constraint's range."""
-        return self.worst / (10.0 * self.bound.scale)
-
-    @property
-    def where(self) -> str:
-        """The row and the time in words; empty without violation."""
-        return f"{self.row} at t = {self.time:.4g} s" if self.worst > 0.0 else ""
-
-
-class Played(NamedTuple):
-    """A motion under commands in parts of a plan's steps: its cost, violations and configurations at the plan's nodes.
-
-    All are NaN where it diverges.
-    """
-
-    cost: float
-    outside: list[Outside]
-    nodes: Floats
-
-
-def played(
-    problem: OptimalControlProblem, fine: OptimalControlProblem, commands: Commands, integrator: Integrator
-) -> Played:
-    """The motion of a problem under commands on ``fine``, the same :meth:`in_parts`."""
-    motion, failure = rollout(fine.scene, integrator, fine.q0, fine.v0, commands, fine.dt)
-    if failure is not None:
-        lost = np.full((1, fine.q0.size), np.nan)
-        return Played(np.nan, [Outside(bound) for bound in fine.bound_constraints], lost)
-    cost = float(fine.costs(motion.q, motion.v, fine.control_rows(motion)))
-    return Played(cost, _outside(problem, fine, motion), motion.q[:: fine.steps // problem.steps])
-
-
-def _outside(problem: OptimalControlProblem, fine: OptimalControlProblem, motion: Trajectory) -> list[Outside]:
-    """The worst violation of each constraint, without margins, by a motion on ``fine``."""
-    found = []
-    for whole, bound in zip(problem.bound_constraints, fine.bound_constraints, strict=True):
-        c = bound.value(motion.q, motion.v, fine.control_rows(motion))
-        excess = np.abs(c) if bound.source.equality else np.maximum(c, 0.0)
-        outside = at_start(problem, whole)
-        if outside is not None:
-            # A row that is violated at the start cannot hold before the first node.
-            excess[: fine.steps // problem.steps - 1, outside > 0.0] = 0.0
-        sample, row = np.unravel_index(int(np.argmax(excess)), excess.shape)
-        found.append(Outside(bound, float(excess[sample, row]), float(bound.times[sample]), bound.rows[row]))
-    return found
-
-
-def at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats | None:
-    """Rows of a state inequality at the fixed start; None for other constraints."""
-    if bound.of_controls or bound.source.equality:
-        return None
-    q, v = (np.tile(state, (problem.steps + 1, 1)) for state in (problem.q0, problem.v0))
-    c: Floats = bound.value(q, v, np.zeros((problem.steps, problem.scene.controls)))[0]
-    return c
-
-
-class OnRobot(NamedTuple):
-    """A plan on the continuous system, and how it was found.
-
-    Attributes:
-        opened: Under its controls alone.
-        closed: With feedback.
-        substeps: Parts of the plan's steps.
-        accuracy: Relative change of the cost that changed more by the last doubling of the parts.
-        decided: Whether the cost with feedback is surely greater than a bound.
-        integrator: The accurate integrator.
-    """
-
-    opened: Played
-    closed: Played
-    substeps: int
-    accuracy: float
-    decided: bool
-    integrator: Integrator
-
-    @property
-    def known(self) -> bool:
-        """Whether the costs are good enough, greater than a bound, or infinite."""
-        return self.accuracy <= _UNKNOWN or self.decided or not np.isfinite([self.opened.cost, self.closed.cost]).any()
-
-    @property
-    def violation(self) -> float:
-        """Largest violation with feedback, relative to the constraint's range; NaN where the motion diverges."""
-        return float(np.max([own.share for own in self.closed.outside], initial=0.0))
-
-    @property
-    def beyond(self) -> str:
-        """The constraint that is violated most, by how much and where, in words; empty where all hold."""
-        worst = max(self.closed.outside, key=lambda own: own.share, default=None)
-        if worst is None or not worst.where:
-            return ""
-        return f"{worst.bound.source.label} is violated by {worst.worst:.2g} {worst.bound.unit} ({worst.where})"
-
-
-def on_robot(
-    problem: OptimalControlProblem,
-    plan: Trajectory,
-    policy: Policy,
-    *,
-    tolerance: float,
     max_substeps: int = 1024,
     progress: Callable[[int, int], None] | None = None,
     above: float = np.inf,
     substeps: int = 2,
-) -> OnRobot:
-    """A plan on the continuous system.
+) -> Verification:
+    """Compare a plan, and its policy on (q, p) or (q, v), with accurate integrations.
 
     The parts of steps, ``substeps`` at first, double until the relative change of both costs is at most ``tolerance``,
     or the cost with feedback is surely greater than ``above``. Where the explicit method does not reach that because of
@@ -362,10 +246,71 @@ def on_robot(
             if decided or accuracy <= tolerance or 2 * parts > max_substeps:
                 break
             parts *= 2
-        found = OnRobot(opened, closed, parts, accuracy, decided, integrator)
-        if found.known or not problem.scene.dissipates:
+        found = Verification(
+            planned_cost=planned_cost,
+            open_loop_cost=opened.cost,
+            closed_loop_cost=closed.cost,
+            open_loop_gap=float(np.abs(opened.nodes[-1] - plan.q[-1]).max()),
+            closed_loop_gap=float(np.abs(closed.nodes[-1] - plan.q[-1]).max()),
+            defect=_defect(problem, plan, parts, integrator),
+            substeps=parts,
+            accuracy=accuracy,
+            integrator=str(integrator),
+            constraints=_violations(problem, plan, opened, closed),
+            decided=decided,
+        )
+        if found.told or not problem.scene.dissipates:
             break
+    if not found.told and above == np.inf:
+        logger.warning("%s", found._reading)
     return found
+
+
+def _violations(
+    problem: OptimalControlProblem, plan: Trajectory, opened: Played, closed: Played
+) -> tuple[ViolationOnRobot, ...]:
+    both = zip(_outside(problem, problem, plan), opened.outside, closed.outside, strict=True)
+    return tuple(
+        ViolationOnRobot(
+            problem.label_of(bound.source), bound.unit, own.worst, alone.worst, fed.worst, str(fed), 10.0 * bound.scale
+        )
+        for bound, (own, alone, fed) in zip(problem.bound_constraints, both, strict=True)
+    )
+
+
+def played(
+    problem: OptimalControlProblem, fine: OptimalControlProblem, commands: Commands, integrator: Integrator
+) -> Played:
+    """The motion of a problem under commands on ``fine``, the same :meth:`in_parts`."""
+    motion, failure = rollout(fine.scene, integrator, fine.q0, fine.v0, commands, fine.dt)
+    if failure is not None:
+        return Played(np.nan, [Outside() for _ in fine.bound_constraints], np.full((1, fine.q0.size), np.nan))
+    cost = float(fine.costs(motion.q, motion.v, fine.control_rows(motion)))
+    return Played(cost, _outside(problem, fine, motion), motion.q[:: fine.steps // problem.steps])
+
+
+def _outside(problem: OptimalControlProblem, fine: OptimalControlProblem, motion: Trajectory) -> list[Outside]:
+    """The worst violation of each constraint, without margins, by a motion on ``fine``."""
+    found = []
+    for whole, bound in zip(problem.bound_constraints, fine.bound_constraints, strict=True):
+        c = bound.value(motion.q, motion.v, fine.control_rows(motion))
+        excess = np.abs(c) if bound.source.equality else np.maximum(c, 0.0)
+        outside = at_start(problem, whole)
+        if outside is not None:
+            # A row that is violated at the start cannot hold before the first node.
+            excess[: fine.steps // problem.steps - 1, outside > 0.0] = 0.0
+        sample, row = np.unravel_index(int(np.argmax(excess)), excess.shape)
+        found.append(Outside(float(excess[sample, row]), float(bound.times[sample]), bound.rows[row]))
+    return found
+
+
+def at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats | None:
+    """Rows of a state inequality at the fixed start; None for other constraints."""
+    if bound.of_controls or bound.source.equality:
+        return None
+    q, v = (np.tile(state, (problem.steps + 1, 1)) for state in (problem.q0, problem.v0))
+    c: Floats = bound.value(q, v, np.zeros((problem.steps, problem.scene.controls)))[0]
+    return c
 
 
 def in_parts(
