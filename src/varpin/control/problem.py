@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,8 +67,9 @@ STAGES = 4
 # Greatest natural frequency of the feedback of first motions, times the period of controls; from 0.1 to 0.5. Singular
 # values of the constraints that are rounding errors, relative to the largest; from 1e-12 to 1e-6.
 _FASTEST, _SINGULAR = 0.25, 1e-9
-# Longest value in a message of a difference, in characters.
-_SHORT = 60
+# Arguments of a problem that another state, time or control before the horizon may change.
+_MOVED = {"q0", "v0", "t0"}
+_GRID = ("dt", "steps", "integrator", "sampling", "hold", "controls", "between_nodes")
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -188,50 +189,51 @@ class OptimalControlProblem(Frozen):
             raise InputError(f"steps = {steps} is no multiple of hold = {hold}")
         word("sampling", sampling, ("midpoint", "gauss", "start"))
         word("controls", controls, ("held", "linear"))
-        linear, cubic = controls == "linear", max(scene.rates, default=-1) >= 0
+        linear = controls == "linear"
         if hold != 1 and (linear or scene.inputs):
             what = "linear controls" if linear else "positions of a KinematicInput"
             raise InputError(f"{what} are decided at every node: leave hold = {hold} out", "hold")
-        if sampling != "gauss" and (linear or cubic):
+        if sampling != "gauss" and (linear or _cubic(scene)):
             what = "linear controls act" if linear else "a cubic KinematicInput acts"
             raise InputError(
                 f"sampling = {sampling!r} misses the nodes, where {what}: leave it out, for 'gauss'", "sampling"
             )
-        t0, (places, rule) = finite("t0", t0), _rule(sampling, dt, cubic=cubic)
-        times, names = t0 + _times(places, steps, dt), scene.robot.joint_names
-        points = Points(times, dt * steps, steps, n, m, t0, names, scene.control_joints, scene.robot)
-        running, terminal = bind_cost(cost, times, points)
+        t0, names = finite("t0", t0), scene.robot.joint_names
         at, speed = joint_array("q0", q0, names), joint_array("v0", v0, names)
         if scene.constraints:
             at, speed, moved = on_constraints(scene, at, speed)
             announce(logger, scene.announced, dt, moved)
         note = "; those of the mechanism belong to varpin.Scene(constraints=)"
-        values = {
-            "scene": scene,
-            "cost": cost,
-            "q0": at,
-            "v0": speed,
-            "dt": dt,
-            "steps": steps,
-            "integrator": integrator_for(scene, at, dt) if integrator is None else integrator,
-            "sampling": sampling,
-            "hold": hold,
-            "t0": t0,
-            "control_limits": named_limits("control_limits", control_limits, scene.control_joints, m),
-            "constraints": tuple_of("constraints", constraints, PlanConstraint, note),
-            "running": running,
-            "terminal": terminal,
-            "places": places,
-            "rule": rule,
-            "rate": control_rate(cost, m, scene.control_joints),
-            "controls": controls,
-            "between_nodes": flag("between_nodes", between_nodes),
-            "integrator_by_default": integrator is None,
-        }
-        for value in (at, speed, places, rule):
-            value.setflags(write=False)
-        vars(self).update(values)
-        vars(self)["bound_constraints"] = self.constraints_on(dt, steps, hold)
+        vars(self).update(
+            scene=scene,
+            cost=cost,
+            q0=at,
+            v0=speed,
+            dt=dt,
+            steps=steps,
+            integrator=integrator_for(scene, at, dt) if integrator is None else integrator,
+            sampling=sampling,
+            hold=hold,
+            t0=t0,
+            control_limits=named_limits("control_limits", control_limits, scene.control_joints, m),
+            constraints=tuple_of("constraints", constraints, PlanConstraint, note),
+            controls=controls,
+            between_nodes=flag("between_nodes", between_nodes),
+            integrator_by_default=integrator is None,
+        )
+        self._bind(Points(np.zeros(0), dt * steps, steps, n, m, t0, names, scene.control_joints, scene.robot))
+
+    def _bind(self, points: Points, known: tuple[BoundSum, BoundSum] | None = None) -> Self:
+        """Bind costs and constraints to the grid; of ``known`` costs, those that do not depend on time are reused."""
+        places, rule = _rule(self.sampling, self.dt, cubic=_cubic(self.scene))
+        times = self.t0 + ((np.arange(self.steps, dtype=np.float64)[:, None] + places) * self.dt).reshape(-1)
+        running, terminal = bind_cost(self.cost, times, points, known)
+        rate = control_rate(self.cost, self.scene.controls, self.scene.control_joints)
+        vars(self).update(places=places, rule=rule, running=running, terminal=terminal, rate=rate)
+        vars(self)["bound_constraints"] = self.constraints_on(self.dt, self.steps, self.hold)
+        for array in (self.q0, self.v0, places, rule):
+            array.setflags(write=False)
+        return self
 
     def __repr__(self) -> str:
         held = f", each control held over {self.hold}" if self.hold > 1 else ", linear controls" if self.linear else ""
@@ -303,27 +305,16 @@ class OptimalControlProblem(Frozen):
         """The time that each control holds [s]."""
         return self.dt * self.hold
 
-    def at(
-        self,
-        *,
-        q0: JointValues | None = None,
-        v0: JointValues | None = None,
-        dt: float | None = None,
-        steps: int | None = None,
-        duration: float | None = None,
-        integrator: Integrator | None = None,
-        sampling: Sampling | None = None,
-        hold: int | None = None,
-        t0: float | None = None,
-        before: JointValues | None = None,
-        controls: Shape | None = None,
-        between_nodes: bool | None = None,
-    ) -> OptimalControlProblem:
-        """The same problem with another discretization or initial state.
+    def at(self, *, before: JointValues | None = None, **changes: Any) -> OptimalControlProblem:
+        """The same problem with other arguments: another discretization, initial state, cost, ...
 
         With ``dt`` alone the horizon stays, and with ``duration`` alone the step; the number of steps follows. An
-        integrator that was left out is chosen anew for the step and the state. ``before`` is the control applied before
-        the horizon, one number, (m,) or by joint name, for :class:`ControlRateCost` and :class:`WithinControlRate`.
+        integrator that was left out is chosen anew for the step and the state.
+
+        Args:
+            before: The control applied before the horizon, one number, (m,) or by joint name, for
+                :class:`ControlRateCost` and :class:`WithinControlRate`.
+            changes: Any arguments of the problem but the scene; None leaves one as it is.
 
         Raises:
             InputError: The horizon is no multiple of ``dt``; ``before`` is given where changes of controls have
@@ -331,24 +322,23 @@ class OptimalControlProblem(Frozen):
         """
         if before is not None and not self.remembers:
             raise InputError("before is what a ControlRateCost or a WithinControlRate begins with: give one")
-        if dt is not None and steps is None and duration is None:
-            duration = self.duration
-        if duration is not None:
-            dt, steps = time_steps(self.dt if dt is None and steps is None else dt, steps, duration)
-        moved: dict[str, Any] = {"q0": q0, "v0": v0, "t0": t0}
-        grid: dict[str, Any] = {"dt": dt, "steps": steps, "integrator": integrator, "sampling": sampling, "hold": hold}
-        grid |= {"controls": controls, "between_nodes": between_nodes}
+        given = {name: value for name, value in changes.items() if value is not None}
+        if "dt" in given and not given.keys() & {"steps", "duration"}:
+            given["duration"] = self.duration
+        if "duration" in given:
+            dt, steps = given.get("dt", None if "steps" in given else self.dt), given.get("steps")
+            given["dt"], given["steps"] = time_steps(dt, steps, given.pop("duration"))
+        moves = given.keys() <= _MOVED
         if before is not None:
             control = control_values("before", before, self.scene.control_joints, self.scene.controls)
-            moved["cost"] = with_control_before(self.cost, control)
-            moved["constraints"] = tuple(item.after(control) for item in self.constraints)
-        changed, other = ({k: x for k, x in given.items() if x is not None} for given in (moved, grid))
-        if not other:
-            return self._moved(changed)
-        same = {name: getattr(self, name) for name in (*moved, *grid, "cost", "constraints", "control_limits")}
+            given["cost"] = with_control_before(given.get("cost", self.cost), control)
+            given["constraints"] = tuple(item.after(control) for item in given.get("constraints", self.constraints))
+        if moves:
+            return self._moved(given)
+        same = {name: getattr(self, name) for name in (*_MOVED, *_GRID, "cost", "constraints", "control_limits")}
         if self.integrator_by_default:
             same["integrator"] = None
-        return OptimalControlProblem(self.scene, **same | changed | other)
+        return OptimalControlProblem(self.scene, **same | given)
 
     def _moved(self, changed: dict[str, Any]) -> OptimalControlProblem:
         """The problem on the same grid, from another state, time or control; only what depends on them is rebuilt."""
@@ -357,20 +347,14 @@ class OptimalControlProblem(Frozen):
         if state and scene.constraints:
             at = {"q0": self.q0, "v0": self.v0} | state
             state["q0"], state["v0"], _ = on_constraints(scene, at["q0"], at["v0"])
+        if "t0" in changed:
+            changed["t0"] = finite("t0", changed["t0"])
+        found = self.changed(**changed | state)
         for array in state.values():
             array.setflags(write=False)
-        changed = changed | state
-        if "cost" in changed:
-            changed["rate"] = control_rate(changed["cost"], scene.controls, scene.control_joints)
-        if "t0" in changed:
-            changed["t0"] = t0 = finite("t0", changed["t0"])
-            times = t0 + _times(self.places, self.steps, self.dt)
-            points = replace(self.running.points, t=times, t0=t0)
-            changed["running"], changed["terminal"] = bind_cost(self.cost, times, points, (self.running, self.terminal))
-        found = self.changed(**changed)
-        if self.constraints and ("constraints" in changed or "t0" in changed):
-            vars(found)["bound_constraints"] = found.constraints_on(found.dt, found.steps, found.hold)
-        return found
+        if changed.keys() <= {"q0", "v0"}:
+            return found
+        return found._bind(replace(self.running.points, t0=found.t0), (self.running, self.terminal))
 
     def in_parts(self, parts: int) -> OptimalControlProblem:
         """The problem in ``parts`` of each step, for motions under commands that are decided as in its own steps.
@@ -378,21 +362,8 @@ class OptimalControlProblem(Frozen):
         Costs are sampled by the rule "gauss". It is not to be solved: the controls of kinematic inputs, and linear
         ones, are those of the parts.
         """
-        dt, steps = self.dt / parts, self.steps * parts
-        places, rule = _rule("gauss", dt, cubic=max(self.scene.rates, default=-1) >= 0)
-        times = self.t0 + _times(places, steps, dt)
-        running, terminal = bind_cost(self.cost, times, self.running.points)
-        return self.changed(
-            dt=dt,
-            steps=steps,
-            hold=1 if self.linear else self.hold * parts,
-            sampling="gauss",
-            places=places,
-            rule=rule,
-            running=running,
-            terminal=terminal,
-            bound_constraints=self.constraints_on(dt, steps, self.hold * parts),
-        )
+        given = {"dt": self.dt / parts, "steps": self.steps * parts, "hold": self.hold * parts, "sampling": "gauss"}
+        return self.changed(**given)._bind(self.running.points)
 
     @cached_property
     def setting(self) -> dict[str, Any]:
@@ -421,10 +392,10 @@ class OptimalControlProblem(Frozen):
         """The first difference from a problem of another :attr:`setting` in words; empty if there is none."""
         for name in dict.fromkeys((*self.setting, *setting)):
             theirs, mine = (np.asarray(one.get(name, np.zeros(0))) for one in (setting, self.setting))
-            texts = mine.dtype.kind == "U" or theirs.dtype.kind == "U"
+            texts = "U" in (mine.dtype.kind, theirs.dtype.kind)
             if not (np.array_equal(theirs, mine) if texts else same(theirs, mine)):
-                short = max(len(str(theirs)), len(str(mine))) <= _SHORT
-                return f"{name} = {theirs}, not {mine}" if short else f"different {name.replace('.', ' ')}"
+                single = mine.ndim == theirs.ndim == 0
+                return f"{name} = {theirs}, not {mine}" if single else f"different {name.replace('.', ' ')}"
         return ""
 
     def mismatch(self, setting: Mapping[str, Any], trajectory: Trajectory, cost: float) -> str:
@@ -501,27 +472,14 @@ class OptimalControlProblem(Frozen):
         reference: Floats,
         on: Literal["momentum", "velocity"],
         *,
-        before: JointValues | None,
-        previous_gains: Floats | None = None,
-        previous: Floats | None = None,
         substeps: int = 1,
+        **options: Any,
     ) -> LinearPolicy:
-        """A policy of the problem's decisions, in ``substeps`` parts of its steps."""
-        return LinearPolicy(
-            u,
-            gains,
-            reference,
-            hold=self.hold * substeps,
-            on=on,
-            limits=(self.control_limits[0], self.control_limits[1]),
-            previous_gains=previous_gains,
-            previous=previous,
-            before=before,
-            period=self.period,
-            joints=self.scene.control_joints,
-            servos=self.scene.servo_joints,
-            linear=self.linear,
-        )
+        """A policy of the problem's decisions, in ``substeps`` parts of its steps; ``options`` as for the policy."""
+        scene, limits = self.scene, (self.control_limits[0], self.control_limits[1])
+        options |= {"limits": limits, "period": self.period, "linear": self.linear, "hold": self.hold * substeps}
+        options |= {"joints": scene.control_joints, "servos": scene.servo_joints}
+        return LinearPolicy(u, gains, reference, on=on, **options)
 
     def _holding_feedback(self) -> Floats:
         """Gains (m, 2n) of :meth:`holding_policy`; zero where joints are not driven or controls are held too long."""
@@ -570,14 +528,17 @@ class OptimalControlProblem(Frozen):
             return at_q, at_v, np.ascontiguousarray(between.reshape(*at_q.shape[:-1], u.shape[-1]))
         return at_q, at_v, u if len(self.rule) == 1 else np.repeat(u, len(self.rule), axis=-2)
 
+    def _end(self, q: Floats, v: Floats) -> tuple[Floats, Floats, Floats]:
+        """The last state of motions, and no control."""
+        return q[..., -1:, :], v[..., -1:, :], np.zeros((*q.shape[:-2], 1, self.scene.controls))
+
     def costs(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """The cost (...) of motions without noise terms: q and v (..., N + 1, n), u (..., N, m)."""
         values = self.running.value(*self.samples(q, v, u))
         # All samples of a rule have the same weight.
         running = values.sum(axis=-1) * (self.dt * self.rule[0, 0])
-        end = np.zeros((*u.shape[:-2], 1, u.shape[-1]))
-        total: Floats = running + self.terminal.value(q[..., -1:, :], v[..., -1:, :], end)[..., 0]
-        return total if self.rate is None else total + self.rate.value(u, self.period)
+        total: Floats = running + self.terminal.value(*self._end(q, v))[..., 0]
+        return total if self.rate is None else total + self.rate.value(u[..., :: self.hold, :], self.period)
 
     def cost_of(self, trajectory: Trajectory) -> float:
         """The cost of one motion on the problem's grid.
@@ -603,10 +564,9 @@ class OptimalControlProblem(Frozen):
         causes no rounding error.
         """
         q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
-        at, weight = self.samples(q, v, u), self.dt * self.rule[0, 0]
-        found = [weight * self.running.compiled(*at).ravel()]
-        found += [weight * (factor * part.value(*at)) for factor, part in self.running.others]
-        found += [values.ravel() for values in self.terminal.shares(q[-1:], v[-1:], np.zeros((1, u.shape[1])))]
+        weight = self.dt * self.rule[0, 0]
+        found = [weight * part.ravel() for part in self.running.shares(*self.samples(q, v, u))]
+        found += [part.ravel() for part in self.terminal.shares(*self._end(q, v))]
         if self.rate is not None:
             found.append(self.rate.shares(u[:: self.hold], self.period))
         return np.concatenate(found)
@@ -614,14 +574,11 @@ class OptimalControlProblem(Frozen):
     def not_finite(self, trajectory: Trajectory) -> tuple[Cost, ...]:
         """The cost terms that are not finite on a motion; those of the controls' rate are not tested."""
         q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
-        along, end = self.samples(q, v, u), (q[-1:], v[-1:], np.zeros((1, u.shape[1])))
         # The parts of both sums are in the order of the cost's terms.
-        found: list[Cost] = []
-        for at_end, (total, at) in enumerate(((self.running, along), (self.terminal, end))):
-            for term, (_, part) in zip(_placed(self.cost, at_end), total.parts, strict=True):
-                if not np.isfinite(part.value(*at)).all():
-                    found.append(term)
-        return tuple(found)
+        pairs = ((self.running, self.samples(q, v, u)), (self.terminal, self._end(q, v)))
+        values = [part.value(*at) for bound, at in pairs for _, part in bound.parts]
+        terms = [term for at_end in (0, 1) for term in _placed(self.cost, at_end)]
+        return tuple(term for term, own in zip(terms, values, strict=True) if not np.isfinite(own).all())
 
     def simulate(
         self,
@@ -658,7 +615,7 @@ class OptimalControlProblem(Frozen):
 
     def expand_terminal(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the terminal costs at the end of a motion, in (q, v, u)."""
-        return self.terminal.expand(trajectory.q[-1:], trajectory.v[-1:], np.zeros((1, self.scene.controls)))
+        return self.terminal.expand(*self._end(trajectory.q, trajectory.v))
 
 
 def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
@@ -696,10 +653,9 @@ def _rule(sampling: str, dt: float, *, cubic: bool) -> tuple[Floats, Floats]:
     return places, np.column_stack([np.full(len(places), 1.0 / len(places)), cubics(places, dt)])
 
 
-def _times(places: Floats, steps: int, dt: float) -> Floats:
-    """Times of all samples since the beginning of the horizon (N s,) [s], at ``places`` in each step."""
-    times: Floats = ((np.arange(steps, dtype=np.float64)[:, None] + places) * dt).reshape(-1)
-    return times
+def _cubic(scene: Scene) -> bool:
+    """Whether a scene has cubic inputs, whose velocities at the nodes are controls."""
+    return max(scene.rates, default=-1) >= 0
 
 
 def bind_cost(
