@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from varpin.control.stages import Feedback, Steps
 from varpin.control.verification import Verification, verify
 from varpin.errors import InputError
 from varpin.finding import Finding
+from varpin.io.archive import Axes
 from varpin.linearization import velocity_at_nodes
 from varpin.signals.policy import LinearPolicy
 from varpin.support.checks import JointValues, count, positive, word
@@ -77,19 +78,19 @@ class Solution(Frozen):
         multipliers: Multipliers of the problem's constraints, with their margins; None without constraints.
     """
 
-    problem: OptimalControlProblem
-    trajectory: Trajectory
-    gains: Floats
-    feedforward: Floats
-    gradient: Floats
+    problem: OptimalControlProblem = field(metadata={"entry": None})
+    trajectory: Trajectory = field(metadata={"entry": None})
+    gains: Annotated[Floats, Axes("decisions", "controls", "states", finite=True)]
+    feedforward: Annotated[Floats, Axes("decisions", "controls", finite=True)]
+    gradient: Annotated[Floats, Axes("decisions", "controls")]
     cost: float
     noise_cost: float
     status: Status
     reason: str
     history: tuple[Iteration, ...]
     search: SearchState | None = None
-    previous_gains: Floats | None = None
-    warnings: tuple[Finding, ...] = ()
+    previous_gains: Annotated[Floats, Axes("decisions", "controls", "controls", finite=True)] | None = None
+    warnings: tuple[Finding, ...] = field(default=(), metadata={"entry": "plan.warnings"})
     refinement: Refinement | None = None
     multipliers: Multipliers | None = None
 
@@ -171,7 +172,7 @@ class Solution(Frozen):
         Raises:
             FileError: The path cannot be written.
         """
-        return write(path, {item.name: getattr(self, item.name) for item in fields(self)})
+        return write(path, self)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], problem: OptimalControlProblem) -> Solution:
@@ -183,7 +184,7 @@ class Solution(Frozen):
         """
         if not isinstance(problem, OptimalControlProblem):
             raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
-        return cls(**read(path, problem))
+        return read(cls, path, problem)
 
     def shifted(self, decisions: int, before: JointValues | None = None) -> LinearPolicy:
         """The policy from a later decision on, its last row repeated, to start the next horizon with.
