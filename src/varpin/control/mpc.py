@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from varpin.control.history import Status
 from varpin.control.multipliers import REPORTED, ConstraintReport, Multipliers, at_nodes, flat
 from varpin.control.rollout import first_commands
 from varpin.control.search import Search
+from varpin.control.solving import searched
 from varpin.errors import InputError, LinearizationError
 from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
@@ -263,12 +264,8 @@ class Mpc:
             search.weight = previous.search.weight
         if previous.multipliers is not None and problem.constraints:
             search.take(_margins(problem, previous, previous.multipliers))
-        try:
-            status = search.run(self.tolerance, self.iterations, deadline, lambda *_: None)
-        except KeyboardInterrupt:
-            status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
         # A tick does not check its plan; the run checks the motion that results.
-        return search.solution(status)
+        return searched(search, self.tolerance, self.iterations, deadline, lambda *_: None)
 
     @one_thread()
     def run(
@@ -283,7 +280,7 @@ class Mpc:
 
         In each tick the first decision of the plan made from the state at its beginning acts, or, where controls are
         linear between nodes, the line between its first two. The first plan is made before the run. Where a search
-        finds no plan in time, the one before acts on with its feedback, up to its end.
+        finds no plan in time, the one before acts on with its feedback, and at its end the last control is held.
 
         Main args:
             plant: None for the problem's own scene, integrated more finely.
@@ -297,8 +294,7 @@ class Mpc:
 
         Raises:
             InputError: A plant with other controls or joints.
-            StepFailure: The plant's motion cannot be integrated. Or all ticks of a plan's horizon were late or without
-                a plan; its cause is the last search's error, if that raised one. It holds the plant's motion so far.
+            StepFailure: The plant's motion cannot be integrated; it holds the motion so far.
             CostError: A custom cost fails; from the second tick on it holds the plant's motion so far.
             Interrupted: Ctrl-C; holds the plant's motion so far. In the first plan, a plain KeyboardInterrupt.
         """
@@ -333,19 +329,30 @@ class Mpc:
         )
         announce(logger, plant.scene.announced, loop.dt, found)
         again = {(finding.kind, finding.joint) for finding in found}
-        first = (finding for finding in loop.plans[0].warnings if (finding.kind, finding.joint) not in again)
+        first = (finding for finding in loop.ticks[0].plan.warnings if (finding.kind, finding.joint) not in again)
         return MpcRun(
             motion,
-            tuple(loop.plans),
-            np.array(loop.seconds),
-            np.array(loop.iterations, dtype=np.int64),
-            np.array(loop.late),
-            np.array(loop.failed),
+            tuple(tick.plan for tick in loop.ticks),
+            np.array([tick.seconds for tick in loop.ticks]),
+            np.array([tick.iterations for tick in loop.ticks], dtype=np.int64),
+            np.array([tick.late for tick in loop.ticks]),
+            np.array([bool(tick.failure) for tick in loop.ticks]),
             self.period,
             self.budget,
             constraints=constraints,
             warnings=(*(finding.about("the first plan: ") for finding in first), *found),
         )
+
+
+class _Tick(NamedTuple):
+    """The plan that acts in a tick, which decision of it, and how planning went."""
+
+    plan: Solution
+    age: int = 0
+    seconds: float = 0.0
+    iterations: int = 0
+    late: bool = False
+    failure: str = ""  # why there is no plan in time; empty if there is one, or it is late
 
 
 class _Loop:
@@ -355,57 +362,44 @@ class _Loop:
         problem = controller.problem
         self.controller, self.problem, self.plant, self.rng = controller, problem, plant, rng
         self.dt = controller.period / plant.substeps
-        self.active, self.age = solve(problem, tolerance=controller.tolerance), 0
-        if self.active.status is Status.INTERRUPTED or any(told.kind == "interrupted" for told in self.active.warnings):
+        self.ticks = [_Tick(solve(problem, tolerance=controller.tolerance))]
+        plan = self.ticks[0].plan
+        if plan.status is Status.INTERRUPTED or any(told.kind == "interrupted" for told in plan.warnings):
             raise KeyboardInterrupt
         self.q, self.v, self.applied = problem.q0, problem.v0, problem.before
         noisy = rng is not None and plant.scene.processes > 0
         self.method = plant.integrator or usual_integrator(plant.scene, self.q, self.v, self.dt, noisy=noisy)
         self.parts: list[Trajectory] = []
-        self.plans: list[Solution] = []
-        self.seconds, self.iterations, self.late, self.failed = [0.0], [0], [False], [False]
-        self.reasons: list[str] = []
 
     def replan(self) -> None:
         """Plan from the present state; where there is no plan in time, the one before acts on."""
-        begin, fresh, failure = time.perf_counter(), None, None
+        begin, fresh, failure, last = time.perf_counter(), None, "", self.ticks[-1]
         t = self.problem.t0 + len(self.parts) * self.controller.period
         before = self.applied if self.problem.remembers else None
         try:
-            fresh = self.controller.plan(t, self.q, self.v, self.active, self.age + 1, before)
+            fresh = self.controller.plan(t, self.q, self.v, last.plan, last.age + 1, before)
         except (StepFailure, LinearizationError, NoiseFieldError) as error:
-            failure = error
+            failure = str(error)
         except CostError as error:
             raise CostError(error.cost, error.problem, self.motion()) from error
         if fresh is not None and fresh.status is Status.INTERRUPTED:
             # A search keeps its best plan and returns; the run is what Ctrl-C is to end.
             raise KeyboardInterrupt
-        self.seconds.append(time.perf_counter() - begin)
-        self.iterations.append(0 if fresh is None else fresh.iterations)
-        # A late plan does not act, whether or not there is one. Without gains a search has found none.
-        self.late.append(self.seconds[-1] > self.controller.budget)
-        self.failed.append(not self.late[-1] and (fresh is None or bool(np.isnan(fresh.gradient).all())))
-        if self.failed[-1]:
-            self.reasons.append(str(failure) if fresh is None else fresh.reason)
-        if fresh is not None and not (self.late[-1] or self.failed[-1]):
-            self.active, self.age = fresh, 0
-            return
-        self.age += 1
-        if self.age >= len(self.active.gains) - self.problem.linear:
-            motion = self.motion()
-            why = f"it took {self.seconds[-1]:.3g} s" if self.late[-1] else self.reasons[-1]
-            told = Failure(f"no plan can be made from here in time, and the last plan is at its end; {why}", np.nan)
-            advice = "Use a longer horizon, a larger budget, or more iterations a tick"
-            raise StepFailure(motion.steps, motion.t[-1], told, motion, advice) from failure
+        seconds, iterations = time.perf_counter() - begin, 0 if fresh is None else fresh.iterations
+        if fresh is not None and np.isnan(fresh.gradient).all():
+            # Without gains a search has found no plan.
+            failure, fresh = fresh.reason, None
+        late = seconds > self.controller.budget
+        plan, age = (last.plan, last.age + 1) if late or fresh is None else (fresh, 0)
+        self.ticks.append(_Tick(plan, age, seconds, iterations, late, "" if late else failure))
 
     def act(self) -> Nodes:
         """Apply the present decision of the active plan over a tick; the plant's motion in it."""
-        self.plans.append(self.active)
-        before = self.applied
-        if self.problem.linear and self.age == 0:
+        plan, age, before = self.ticks[-1].plan, self.ticks[-1].age, self.applied
+        if self.problem.linear and age == 0:
             # A fresh plan begins at the measured state; one that acts on, where the line before ended.
-            before = self.active.controls[0]
-        self.applied = _decision(self.active, self.age, np.concatenate([self.q, self.v]), before)
+            before = plan.controls[0]
+        self.applied = _decision(plan, age, np.concatenate([self.q, self.v]), before)
         scene, substeps = self.plant.scene, self.plant.substeps
         # Joints with kinematic inputs move on one line or cubic to their next positions over the tick.
         controls: Any = in_parts_of_steps(
@@ -437,21 +431,30 @@ class _Loop:
 
     def without_plans(self) -> list[Finding]:
         """Warnings if more than a few plans took longer than the budget or the period, or searches found no plan."""
-        seconds, limit = np.array(self.seconds[1:]), min(self.controller.period, self.controller.budget)
-        slow, found = int((seconds > limit).sum()), []
-        if slow > _FEW * len(seconds):
+        ticks, period, found = self.ticks[1:], self.controller.period, []
+        seconds, limit = np.array([tick.seconds for tick in ticks]), min(period, self.controller.budget)
+        slow, failed = int((seconds > limit).sum()), [tick.failure for tick in ticks if tick.failure]
+        if slow > _FEW * len(ticks):
             text = (
-                f"planning took longer than {1e3 * limit:.3g} ms in {slow} of {len(seconds)} ticks "
+                f"planning took longer than {1e3 * limit:.3g} ms in {slow} of {len(ticks)} ticks "
                 f"({1e3 * seconds.mean():.3g} ms in the mean). Use fewer steps, fewer iterations, a larger budget or a "
                 "longer period (hold=)"
             )
             found.append(Finding("late plans", text))
-        if self.reasons:
+        if failed:
+            first = [bool(tick.failure) for tick in self.ticks].index(True) * period
             text = (
-                f"in {sum(self.failed)} of {len(seconds)} ticks no plan was found and an older one acted, at t = "
-                f"{self.failed.index(True) * self.controller.period:.4g} s for the first time: {self.reasons[0]}"
+                f"in {len(failed)} of {len(ticks)} ticks no plan was found and an older one acted, at t = {first:.4g} "
+                f"s for the first time: {failed[0]}"
             )
             found.append(Finding("failed ticks", text))
+        ended = [tick.age >= _lines(tick.plan) for tick in self.ticks]
+        if any(ended):
+            text = (
+                f"no plan came for a whole horizon, and from t = {ended.index(True) * period:.4g} s on the last "
+                "control was held: use a longer horizon, a larger budget, or more iterations a tick"
+            )
+            found.append(Finding("plan at its end", text))
         return found
 
     def constraints(self, motion: Trajectory) -> tuple[tuple[ConstraintReport, ...], list[Finding]]:
@@ -459,11 +462,12 @@ class _Loop:
         problem, reports, found = self.problem, [], []
         # A plant's motion has the means of lines over its steps.
         hold = 1 if problem.linear else self.plant.substeps
-        violated = np.array([_violated(plan) for plan in self.plans])
+        plans = [tick.plan for tick in self.ticks]
+        violated = np.array([_violated(plan) for plan in plans])
         for i, bound in enumerate(problem.constraints_on(motion.dt, motion.steps, hold, linear=False)):
             label = problem.label_of(bound.source)
             if violated[:, i].any():
-                planned = [plan.constraints[i].violation for plan in self.plans]
+                planned = [plan.constraints[i].violation for plan in plans]
                 tick = int(np.argmax(planned))
                 text = (
                     f"in {int(violated[:, i].sum())} of {len(planned)} ticks no plan was found that keeps to {label}; "
@@ -502,12 +506,20 @@ def _require_fit(plant: Scene, planned: Scene) -> None:
             raise InputError(f"the plant has other {what} than the problem: {of(plant)}, not {of(planned)}")
 
 
+def _lines(plan: Solution) -> int:
+    """How many ticks a plan lasts."""
+    return plan.problem.decisions - plan.problem.linear
+
+
 def _decision(plan: Solution, age: int, x: Floats, before: Floats | None) -> Floats:
     """Control (m,) of the plan's decision ``age`` with feedback at the state x = (q, v), after the control ``before``.
 
     Where controls are linear between nodes it is the control at the end of the tick, and ``before`` that at its begin.
     """
-    u = plan.policy_on("velocity").control(age, x, before)
+    if age < _lines(plan):
+        u = plan.policy_on("velocity").control(age, x, before)
+    else:
+        u = plan.shifted(plan.problem.decisions - 1, x="velocity").control(0, x, before)
     for bound in plan.problem.bound_constraints:
         if isinstance(bound, BoundRate) and before is not None:
             most = bound.limit * bound.period

@@ -66,7 +66,7 @@ _STIFF = 10.0
 STAGES = 4
 # Greatest natural frequency of the feedback of first motions, times the period of controls; from 0.1 to 0.5. Singular
 # values of the constraints that are rounding errors, relative to the largest; from 1e-12 to 1e-6.
-_FASTEST, _SINGULAR = 0.25, 1e-9
+FASTEST, _SINGULAR = 0.25, 1e-9
 # Arguments of a problem that another state, time or control before the horizon may change.
 _MOVED = {"q0", "v0", "t0"}
 _GRID = ("dt", "steps", "integrator", "sampling", "hold", "controls", "between_nodes")
@@ -481,25 +481,32 @@ class OptimalControlProblem(Frozen):
         options |= {"joints": scene.control_joints, "servos": scene.servo_joints}
         return LinearPolicy(u, gains, reference, on=on, **options)
 
+    def feedback(self, omega: float) -> Floats:
+        """Gains (m, 2n) on x of the forces -M(q0) (omega^2 dq + 2 omega dv), as far as controls give them."""
+        scene, n = self.scene, self.q0.size
+        mass, along = lagrangian_jet(scene, self.q0, np.zeros(n)).Lvv, tangent_basis(scene, self.q0)
+        on_speeds = np.eye(n) if self.integrator.variational else mass
+        wanted = along.T @ np.hstack([omega**2 * mass, 2.0 * omega * on_speeds])
+        gains: Floats = -np.linalg.pinv(along.T @ scene.actuation) @ wanted
+        gains[scene.prescribed] = 0.0
+        return gains
+
     def _holding_feedback(self) -> Floats:
         """Gains (m, 2n) of :meth:`holding_policy`; zero where joints are not driven or controls are held too long."""
         scene, q = self.scene, self.q0
         jet, along = lagrangian_jet(scene, q, np.zeros(q.size)), tangent_basis(scene, q)
-        mass, curvature, driven = jet.Lvv, jet.Lqq, along.T @ scene.actuation
+        curvature, driven = jet.Lqq, along.T @ scene.actuation
         if scene.constraints:
             # Constraint forces change with q, too.
             (C,) = scene.core.constraints(q[None])[2]
             left = scene.actuation @ self.holding_controls() - scene.static_pull(q)
             y = np.linalg.lstsq(C.T, left, rcond=_SINGULAR)[0]
             curvature = curvature - scene.core.constraint_curvature(q, y, np.zeros(q.size))[0]
-        squares = np.linalg.eigvals(np.linalg.solve(along.T @ mass @ along, along.T @ curvature @ along))
+        squares = np.linalg.eigvals(np.linalg.solve(along.T @ jet.Lvv @ along, along.T @ curvature @ along))
         omega = 2.0 * float(np.sqrt(np.abs(squares).max(initial=0.0))) + 1.0 / self.duration
-        if np.linalg.matrix_rank(driven) < len(driven) or omega * self.period > _FASTEST:
+        if np.linalg.matrix_rank(driven) < len(driven) or omega * self.period > FASTEST:
             return np.zeros((scene.controls, 2 * q.size))
-        on_speeds = np.eye(q.size) if self.integrator.variational else mass
-        wanted = along.T @ np.hstack([omega**2 * mass, 2.0 * omega * on_speeds])
-        gains: Floats = -np.linalg.pinv(driven) @ wanted
-        return gains
+        return self.feedback(omega)
 
     def decided(self, trajectory: Trajectory) -> Floats:
         """The controls (R, m) of a motion on the problem's grid, one row per decision."""

@@ -127,7 +127,7 @@ class Solution(Frozen):
     @property
     def policy(self) -> LinearPolicy:
         """Controls with feedback, on the x of the problem's integrator."""
-        return self.policy_on("momentum" if self.problem.integrator.variational else "velocity")
+        return self.policy_on(self._x)
 
     def __repr__(self) -> str:
         noise = f" + {self.noise_cost:.4g} by noise" if self.noise_cost else ""
@@ -186,26 +186,30 @@ class Solution(Frozen):
             raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
         return read(cls, path, problem)
 
-    def shifted(self, decisions: int, before: JointValues | None = None) -> LinearPolicy:
+    def shifted(
+        self, decisions: int, before: JointValues | None = None, x: Literal["momentum", "velocity"] | None = None
+    ) -> LinearPolicy:
         """The policy from a later decision on, its last row repeated, to start the next horizon with.
 
         Where controls are linear between nodes, the last control is held with the feedback of the plan's middle about
         its last state: near the end of a plan the feedback of linear controls is no stable law.
 
         ``before`` is the control before that decision, (m,) or by joint name; by default the plan's own. Where controls
-        are linear between nodes, it is the control of that decision itself, with which the first line begins.
+        are linear between nodes, it is the control of that decision itself, with which the first line begins. ``x`` is
+        what the policy reacts to, by default that of the problem's integrator; see :meth:`policy_on`.
 
         Raises:
             InputError: ``decisions`` is not from 0 to R - 1, or a control has a wrong shape.
         """
         if not 0 <= count("decisions", decisions) < len(self.gains):
             raise InputError(f"decisions must be from 0 to {len(self.gains) - 1}, got {decisions}")
-        policy, motion, N = self.policy, self.trajectory, len(self.policy.u)
+        on = x or self._x
+        policy, motion, N = self.policy_on(on), self.trajectory, self.problem.decisions - self.problem.linear
         later = np.arange(N) + decisions
         rows = np.minimum(later, N - 1)
         u, reference, expected = policy.u[rows], policy.reference[rows], policy.u[:0]
         if self.problem.linear:
-            second = motion.p if policy.on == "momentum" else motion.v
+            second = motion.p if on == "momentum" else motion.v
             reference = np.where((later >= N)[:, None], np.append(motion.q[-1], second[-1]), reference)
             rows = np.where(later >= N, N // 2, rows)
             expected = self.controls[decisions, None]
@@ -215,9 +219,12 @@ class Solution(Frozen):
         previous_gains = None if policy.previous_gains is None else policy.previous_gains[rows]
         # A repeated control has itself as its previous one.
         previous = None if previous_gains is None else np.vstack([expected, u[:-1]])
-        on: Literal["momentum", "velocity"] = "velocity" if policy.on == "velocity" else "momentum"
         given = u, policy.gains[rows], reference, on
         return self.problem.policy_of(*given, before=before, previous_gains=previous_gains, previous=previous)
+
+    @property
+    def _x(self) -> Literal["momentum", "velocity"]:
+        return "momentum" if self.problem.integrator.variational else "velocity"
 
     def policy_on(self, x: Literal["momentum", "velocity"], substeps: int = 1) -> LinearPolicy:
         """The policy on (q, p) or on (q, v), each control held over ``substeps`` times as many steps.

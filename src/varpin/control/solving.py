@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from varpin.control.history import ITERATIONS, Iteration, Status
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refine import SUFFICIENT, refine
 from varpin.control.rollout import controls_along, first_commands
-from varpin.control.search import Search
+from varpin.control.search import Report, Search
 from varpin.control.solution import Solution
 from varpin.control.starts import Path, commands_along, path_of
 from varpin.errors import InputError
@@ -142,7 +143,7 @@ def solve(
         # The search may take long where values are in wrong units.
         announce(logger, problem.scene.announced, problem.dt, foreseen(problem))
 
-    def searched(
+    def plan_of(
         problem: OptimalControlProblem,
         controls: JointValues | LinearPolicy | Solution | None,
         resume: Solution | None = None,
@@ -165,26 +166,33 @@ def solve(
                 # A converged search reports once more after its last iteration.
                 progress(min(item.index + 1 - known, most), most)
 
-        try:
-            status = search.run(tolerance, most, deadline, report)
-        except KeyboardInterrupt:
-            status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
-        if status is Status.INFEASIBLE and not (controls is None and path is None):
-            search.reason += "; the default start, without controls= and states=, may have a plan"
-        return search.solution(status)
+        plan = searched(search, tolerance, most, deadline, report)
+        if plan.status is Status.INFEASIBLE and not (controls is None and path is None):
+            advice = "; the default start, without controls= and states=, may have a plan"
+            return replace(plan, reason=plan.reason + advice)
+        return plan
 
     with one_thread():
         if true_cost is None:
-            solution = searched(problem, controls, resume, path)
+            solution = plan_of(problem, controls, resume, path)
         else:
             wish = positive("true_cost", true_cost, "1")
 
             def once(finer: OptimalControlProblem, start: Trajectory | None) -> Solution:
                 given, on = (controls, path) if start is None else (finer.decided(start), (start.q, start.v))
-                return searched(finer, given, None, on, max(tolerance, SUFFICIENT * wish))
+                return plan_of(finer, given, None, on, max(tolerance, SUFFICIENT * wish))
 
             solution = refine(problem, once, wish, lambda: deadline - time.perf_counter())
     return looked_at(solution) if check else solution
+
+
+def searched(search: Search, tolerance: float, most: int, deadline: float, report: Report) -> Solution:
+    """What a search finds in at most so many iterations; Ctrl-C ends it with the best motion so far."""
+    try:
+        status = search.run(tolerance, most, deadline, report)
+    except KeyboardInterrupt:
+        status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
+    return search.solution(status)
 
 
 def _require_resumable(problem: OptimalControlProblem, resume: Solution) -> None:
