@@ -6,6 +6,7 @@ import itertools
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -41,6 +42,7 @@ from varpin.model import (
     Robot,
     degrees_hint,
     joint_unit,
+    longest_reach,
     looks_like_degrees,
     millimetres_hint,
 )
@@ -53,16 +55,15 @@ logger = logging.getLogger(__name__)
 
 # Parts of a step in which a plan is played again.
 PARTS = 4
-# Greatest relative excess over the plan's cost, and shortfall, in parts of its steps without a warning.
+# Greatest relative excess over the plan's cost, and shortfall, in parts of its steps without a warning. The latter is
+# also the share of the torque that holds a posture which limits may be short of.
 LOSS, GAIN = 1e-3, 1e-2
 # Part of the expected cost by which noise may cost other than planned in half steps without a warning.
 _NOISE_OFF = 0.02
 # Standard deviation of a velocity, in widths of its dry friction, up to which tanh is linear to 6 %.
 _LINEAR_FRICTION = 0.25
-# Share of the torque that holds a posture which limits may be short of without a word.
-_SHARE_OF_WEIGHT = 0.01
-# Tolerance on positions and joint limits [m or rad].
-_SAME = 1e-6
+# Angle of a swing under gravity from which on no step follows it [rad]: a quarter of a period.
+_QUARTER = 0.5 * np.pi
 
 
 def looked_at(solution: Solution) -> Solution:
@@ -102,9 +103,22 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
 def foreseen(problem: OptimalControlProblem) -> list[Finding]:
     """Findings about a problem before any search; where values are in wrong units, these alone."""
     goals = [*_goals(problem)]
-    units = [*in_other_units(problem.scene, problem.q0), *_in_degrees(problem), *_in_millimetres(problem)]
-    units += [own for own in goals if own.kind == "goal in millimetres"]
+    units = [*in_other_units(problem.scene, problem.q0), *_in_milliseconds(problem), *_in_degrees(problem)]
+    units += [*_in_millimetres(problem), *(own for own in goals if own.kind == "goal in millimetres")]
     return [*ranked(units)] or [*_starts_outside(problem), *goals, *_outside(problem), *_weights(problem)]
+
+
+def _in_milliseconds(problem: OptimalControlProblem) -> Iterator[Finding]:
+    """A step in which the stretched arm swings by a quarter of its period under gravity."""
+    robot, pull = problem.scene.robot, float(np.linalg.norm(problem.scene.gravity))
+    length = longest_reach(robot, slides=False)
+    angle = problem.dt * np.sqrt(pull / length) if length > 0.0 else 0.0
+    if angle > _QUARTER:
+        sentence = (
+            f"dt = {problem.dt:g} s may be in milliseconds, and times are in seconds: {robot.name} would swing by "
+            f"{angle:.3g} rad under gravity in one step"
+        )
+        yield Finding("step in milliseconds", sentence, value=problem.dt, unit="s")
 
 
 def _starts_outside(problem: OptimalControlProblem) -> Iterator[Finding]:
@@ -121,12 +135,12 @@ def _starts_outside(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Goals and targets that their frame cannot reach."""
-    robot, places = problem.scene.robot, []
+    robot, places = problem.scene.robot, list[tuple[str, str, Floats, Any]]()
     for term in problem.cost.terms:
         if isinstance(term, FramePositionCost) and not callable(term.target):
             strengths, axes = np.linalg.eigh(weight_matrix("FramePositionCost", term.weight, 3))
-            weighed = axes[:, strengths > _SAME * strengths[-1]]
-            places.append((f"FramePositionCost({term.frame!r})", term.frame, weighed, np.asarray(term.target)))
+            weighed = axes[:, strengths > FEASIBLE * strengths[-1]]
+            places.append((f"FramePositionCost({term.frame!r})", term.frame, weighed, term.target))
     for goal in problem.constraints:
         if isinstance(goal, ReachFrame) and goal.position is not None:
             places.append((goal.label, goal.frame, np.eye(3), goal.position))
@@ -134,15 +148,13 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
         kinematics = frame_kinematics(robot, frame)
         most, root = reach(robot, kinematics), kinematics.links.tree.translation[0]
         away = float(np.linalg.norm((np.atleast_2d(place) - root) @ axes, axis=1).max())
-        if away > most * (1.0 + _SAME):
-            kind, why = "goal out of reach", "no motion gets there"
-            if away > AFAR * most:
-                kind, why = "goal in millimetres", IN_MILLIMETRES
+        if away > most * (1.0 + FEASIBLE):
+            far = away > AFAR * most
             sentence = (
                 f"{label} has its goal {away:.4g} m from the first joint, and the frame gets {most:.4g} m from there "
-                f"at most: {why}"
+                f"at most: {IN_MILLIMETRES if far else 'no motion gets there'}"
             )
-            yield Finding(kind, sentence)
+            yield Finding("goal in millimetres" if far else "goal out of reach", sentence)
 
 
 def reach(robot: Robot, frame: FrameKinematics) -> float:
@@ -175,14 +187,17 @@ def _postures(problem: OptimalControlProblem) -> Iterator[Floats]:
             yield end
 
 
+def _limits(problem: OptimalControlProblem) -> list[WithinJointLimits]:
+    return [item for item in problem.constraints if isinstance(item, WithinJointLimits)]
+
+
 def _outside(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Goal configurations outside of joint limits."""
     robot = problem.scene.robot
-    limits = [item for item in problem.constraints if isinstance(item, WithinJointLimits)]
-    for end, (own, (lower, upper)) in itertools.product(_postures(problem), ((item, item.limits) for item in limits)):
-        beyond = np.maximum(end - upper, lower - end)
+    for end, own in itertools.product(_postures(problem), _limits(problem)):
+        beyond = np.maximum(end - own.limits[1], own.limits[0] - end)
         joint = int(np.argmax(beyond))
-        if beyond[joint] > _SAME:
+        if beyond[joint] > FEASIBLE:
             sentence = (
                 f"the terminal TrackingCost has its goal for {robot.joint_names[joint]} {beyond[joint]:.4g} "
                 f"{joint_unit(robot, joint)} outside {own.label}, where the plan will not end"
@@ -201,7 +216,7 @@ def _weights(problem: OptimalControlProblem) -> Iterator[Finding]:
         needed, (lower, upper) = closest_controls(scene, q), problem.control_limits
         beyond = np.maximum(needed - upper, lower - needed)
         joint = int(np.argmax(beyond))
-        if beyond[joint] > _SHARE_OF_WEIGHT * abs(needed[joint]):
+        if beyond[joint] > GAIN * abs(needed[joint]):
             sentence = (
                 f"control limits cannot hold the arm at rest at {where}: joint {names[joint]!r} needs "
                 f"{needed[joint]:.3g}, and its limits are {lower[joint]:.3g} and {upper[joint]:.3g}"
@@ -215,16 +230,15 @@ def _in_degrees(problem: OptimalControlProblem) -> Iterator[Finding]:
     for end in _postures(problem):
         if sentence := degrees_hint(robot, "the goal of the terminal TrackingCost", end):
             yield Finding("goal in degrees", sentence)
-    for own in problem.constraints:
-        if isinstance(own, WithinJointLimits):
-            # Limits of the robot's description are in radians, however wide.
-            given = np.isfinite(own.limits) & (own.limits != robot.position_limits) & ~robot.slides
-            most = np.where(given, np.abs(own.limits), 0.0).max(axis=0)
-            joint = int(np.argmax(most))
-            if looks_like_degrees(most[joint]):
-                name = robot.joint_names[joint]
-                sentence = f"{own.label} lets {name} turn to {most[joint]:.4g} rad, and looks like degrees: {ADVICE}"
-                yield Finding("limits in degrees", sentence)
+    for own in _limits(problem):
+        # Limits of the robot's description are in radians, however wide.
+        given = np.isfinite(own.limits) & (own.limits != robot.position_limits) & ~robot.slides
+        most = np.where(given, np.abs(own.limits), 0.0).max(axis=0)
+        joint = int(np.argmax(most))
+        if looks_like_degrees(most[joint]):
+            name = robot.joint_names[joint]
+            sentence = f"{own.label} lets {name} turn to {most[joint]:.4g} rad, and looks like degrees: {ADVICE}"
+            yield Finding("limits in degrees", sentence)
 
 
 def _in_millimetres(problem: OptimalControlProblem) -> Iterator[Finding]:

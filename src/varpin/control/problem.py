@@ -479,6 +479,9 @@ class OptimalControlProblem(Frozen):
         scene, limits = self.scene, (self.control_limits[0], self.control_limits[1])
         options |= {"limits": limits, "period": self.period, "linear": self.linear, "hold": self.hold * substeps}
         options |= {"joints": scene.control_joints, "servos": scene.servo_joints}
+        if scene.processes and self.integrator.variational == (on == "momentum"):
+            # Feedback and margins are for the noise as this method takes it.
+            options["integrator"] = self.integrator
         return LinearPolicy(u, gains, reference, on=on, **options)
 
     def feedback(self, omega: float) -> Floats:
