@@ -20,19 +20,16 @@ from varpin.control.multipliers import REPORTED, ConstraintReport, Multipliers, 
 from varpin.control.rollout import first_commands
 from varpin.control.search import Search
 from varpin.control.solving import searched
-from varpin.errors import InputError, LinearizationError
+from varpin.errors import ControlError, InputError, LinearizationError
 from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
-from varpin.integrators.base import Failure
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.scene import Scene, require_scene
-from varpin.mechanics.wiener import generator, wiener_increments
+from varpin.mechanics.wiener import generator
 from varpin.signals.commands import in_parts_of_steps, with_ends
-from varpin.signals.policy import FirstOrderHold
 from varpin.simulation.check import check
 from varpin.simulation.choice import usual_integrator
-from varpin.simulation.failures import Interrupted, StepFailure
-from varpin.simulation.limits import beyond_limits
+from varpin.simulation.failures import StepFailure
 from varpin.simulation.loop import unstable_loop
 from varpin.simulation.record import Progress
 from varpin.simulation.simulate import noise_forgotten, simulate
@@ -40,7 +37,7 @@ from varpin.support.checks import JointValues, control_values, count, positive, 
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, warning_count
 from varpin.support.one_thread import one_thread
-from varpin.trajectory import Nodes, Trajectory, chained
+from varpin.trajectory import Nodes, Trajectory
 
 logger = logging.getLogger(__name__)
 
@@ -58,7 +55,7 @@ class Plant:
         scene: Its scene, with the controls of the planned one; masses, friction and noise may differ.
         integrator: Any of varpin's. By default each run takes the one that :func:`varpin.simulate` chooses at the
             plant's step for the start, all joint stops included; ``motion.integrator`` names it.
-        substeps: Steps per decision of the controller.
+        substeps: Steps per decision of the controller; each holds the mean of a line of linear controls.
     """
 
     scene: Scene
@@ -298,36 +295,39 @@ class Mpc:
             CostError: A custom cost fails; from the second tick on it holds the plant's motion so far.
             Interrupted: Ctrl-C; holds the plant's motion so far. In the first plan, a plain KeyboardInterrupt.
         """
-        report: Any = progress
-        moving = told_motion("progress", progress, "ticks done, ticks in all", "nodes")
+        told_motion("progress", progress, "ticks done, ticks in all", "nodes")
         plant = Plant(self.problem.scene) if plant is None else plant
         if not isinstance(plant, Plant):
             raise InputError(f"plant must be a varpin.Plant, for example varpin.Plant(scene), got {plant!r}")
         _require_fit(plant.scene, self.problem.scene)
         ticks = max(1, round(positive("duration", duration, "s") / self.period))
-        loop = _Loop(self, plant, None if rng is None else generator(rng))
+        drawn = None if rng is None else generator(rng)
+        loop = _Loop(self, plant, ticks, progress)
+        scene, start, dt = plant.scene, (self.problem.q0, self.problem.v0), self.period / plant.substeps
+        noisy = drawn is not None and scene.processes > 0
+        method = plant.integrator or usual_integrator(scene, *start, dt, noisy=noisy)
+        given: dict[str, Any] = {"dt": dt, "steps": ticks * plant.substeps, "integrator": method}
+        given |= {"rng": drawn} if noisy else {"increments": 0.0}
         try:
-            for tick in range(ticks):
-                if tick > 0:
-                    loop.replan()
-                nodes = loop.act()
-                if report is not None:
-                    report(tick + 1, ticks, *([nodes] if moving else []))
-        except KeyboardInterrupt:
-            if not loop.parts:
-                raise
-            raise Interrupted(loop.motion()) from None
+            # The run is checked, and its findings logged, at the end.
+            motion = simulate(scene, *start, controls=loop, check=False, **given)
+        except ControlError as error:
+            cause = error.__cause__
+            if isinstance(cause, CostError):
+                raise CostError(cause.cost, cause.problem, error.trajectory) from cause
+            raise cause or error from None
+        loop.report(motion.t[-1], motion.q[-1], motion.v[-1])
         # The controller corrects the errors of a tick in the next.
-        motion = check(plant.scene, loop.method, chained(loop.parts), restart=plant.substeps)
+        motion = check(scene, method, motion.changed(warnings=()), restart=plant.substeps)
         constraints, violated = loop.constraints(motion)
         found = (
-            *noise_forgotten(plant.scene, rng),
-            *unstable_loop(plant.scene, motion, plant.substeps),
+            *noise_forgotten(scene, rng),
+            *unstable_loop(scene, motion, plant.substeps),
             *motion.warnings,
             *loop.without_plans(),
             *violated,
         )
-        announce(logger, plant.scene.announced, loop.dt, found)
+        announce(logger, scene.announced, dt, found)
         again = {(finding.kind, finding.joint) for finding in found}
         first = (finding for finding in loop.ticks[0].plan.warnings if (finding.kind, finding.joint) not in again)
         return MpcRun(
@@ -356,32 +356,45 @@ class _Tick(NamedTuple):
 
 
 class _Loop:
-    """A controller and its plant: the state at the beginning of a tick, and the ticks before."""
+    """A controller as the control law of its plant: at the beginning of each tick a plan, within it a decision."""
 
-    def __init__(self, controller: Mpc, plant: Plant, rng: np.random.Generator | None) -> None:
-        problem = controller.problem
-        self.controller, self.problem, self.plant, self.rng = controller, problem, plant, rng
-        self.dt = controller.period / plant.substeps
-        self.ticks = [_Tick(solve(problem, tolerance=controller.tolerance))]
+    def __init__(self, controller: Mpc, plant: Plant, ticks: int, progress: Progress | None) -> None:
+        self.controller, self.problem, self.plant = controller, controller.problem, plant
+        self.count, self.progress = ticks, progress
+        self.ticks = [_Tick(solve(self.problem, tolerance=controller.tolerance))]
         plan = self.ticks[0].plan
         if plan.status is Status.INTERRUPTED or any(told.kind == "interrupted" for told in plan.warnings):
             raise KeyboardInterrupt
-        self.q, self.v, self.applied = problem.q0, problem.v0, problem.before
-        noisy = rng is not None and plant.scene.processes > 0
-        self.method = plant.integrator or usual_integrator(plant.scene, self.q, self.v, self.dt, noisy=noisy)
-        self.parts: list[Trajectory] = []
+        self.applied = self.problem.before
+        self.nodes: list[tuple[float, Floats, Floats]] = []  # of the tick so far
+        self.rows = np.zeros((0, plant.scene.controls))  # controls of its steps
 
-    def replan(self) -> None:
+    def __call__(self, t: float, q: Floats, v: Floats) -> Floats:
+        """The control (m,) of the plant's next step, at time ``t`` since the beginning of the run [s]."""
+        if len(self.nodes) == self.plant.substeps:
+            self.report(t, q, v)
+            self.replan(t, q, v)
+        if not self.nodes:
+            self.decide(q, v)
+        self.nodes.append((t, q, v))
+        return np.asarray(self.rows[len(self.nodes) - 1])
+
+    def report(self, t: float, q: Floats, v: Floats) -> None:
+        """Tell of a tick that has ended at time ``t`` [s]."""
+        told: Any = self.progress
+        nodes, self.nodes = Nodes(*map(np.array, zip(*self.nodes, (t, q, v), strict=True))), []
+        if told is not None:
+            moving = told_motion("progress", told, "ticks done, ticks in all", "nodes")
+            told(len(self.ticks), self.count, *([nodes] if moving else []))
+
+    def replan(self, t: float, q: Floats, v: Floats) -> None:
         """Plan from the present state; where there is no plan in time, the one before acts on."""
         begin, fresh, failure, last = time.perf_counter(), None, "", self.ticks[-1]
-        t = self.problem.t0 + len(self.parts) * self.controller.period
         before = self.applied if self.problem.remembers else None
         try:
-            fresh = self.controller.plan(t, self.q, self.v, last.plan, last.age + 1, before)
+            fresh = self.controller.plan(self.problem.t0 + t, q, v, last.plan, last.age + 1, before)
         except (StepFailure, LinearizationError, NoiseFieldError) as error:
             failure = str(error)
-        except CostError as error:
-            raise CostError(error.cost, error.problem, self.motion()) from error
         if fresh is not None and fresh.status is Status.INTERRUPTED:
             # A search keeps its best plan and returns; the run is what Ctrl-C is to end.
             raise KeyboardInterrupt
@@ -393,41 +406,18 @@ class _Loop:
         plan, age = (last.plan, last.age + 1) if late or fresh is None else (fresh, 0)
         self.ticks.append(_Tick(plan, age, seconds, iterations, late, "" if late else failure))
 
-    def act(self) -> Nodes:
-        """Apply the present decision of the active plan over a tick; the plant's motion in it."""
-        plan, age, before = self.ticks[-1].plan, self.ticks[-1].age, self.applied
+    def decide(self, q: Floats, v: Floats) -> None:
+        """Make the controls of a tick: the decision of the plan that acts, or the line to it, at means of the steps."""
+        (plan, age, *_), scene, before, substeps = self.ticks[-1], self.plant.scene, self.applied, self.plant.substeps
         if self.problem.linear and age == 0:
             # A fresh plan begins at the measured state; one that acts on, where the line before ended.
             before = plan.controls[0]
-        self.applied = _decision(plan, age, np.concatenate([self.q, self.v]), before)
-        scene, substeps = self.plant.scene, self.plant.substeps
+        self.applied = _decision(plan, age, np.concatenate([q, v]), before)
         # Joints with kinematic inputs move on one line or cubic to their next positions over the tick.
-        controls: Any = in_parts_of_steps(
-            scene, self.applied[None], self.q[None], self.v[None], self.controller.period, substeps
-        )
+        self.rows = in_parts_of_steps(scene, self.applied[None], q[None], v[None], self.controller.period, substeps)
         if self.problem.linear and before is not None:
-            line = FirstOrderHold(np.vstack([before, self.applied])).refined(substeps).u
-            controls = FirstOrderHold(np.vstack([line[:1], with_ends(scene, line[1:], controls)]))
-        drawn = wiener_increments(scene.processes, self.dt, substeps, self.rng)
-        options: dict[str, Any] = {"dt": self.dt, "steps": substeps, "controls": controls, "integrator": self.method}
-        options["increments"] = drawn if len(drawn) else 0.0
-        try:
-            # The whole run is checked, and its findings logged, at the end.
-            part = simulate(scene, self.q, self.v, **options, check=False)
-        except StepFailure as failure:
-            self.parts.append(failure.trajectory)
-            whole = self.motion()
-            cause = Failure(failure.reason, failure.residual)
-            raise StepFailure(whole.steps, whole.t[-1], cause, whole) from None
-        nodes = Nodes(len(self.parts) * self.controller.period + part.t, part.q, part.v)
-        self.parts.append(part)
-        self.q, self.v = part.q[-1], part.v[-1]
-        return nodes
-
-    def motion(self) -> Trajectory:
-        """The plant's motion so far, with its warnings and those of ticks without a plan."""
-        motion = chained(self.parts)
-        return motion.changed(warnings=(*beyond_limits(self.plant.scene, motion), *self.without_plans()))
+            share = (np.arange(substeps)[:, None] + 0.5) / substeps
+            self.rows = with_ends(scene, before + share * (self.applied - before), self.rows)
 
     def without_plans(self) -> list[Finding]:
         """Warnings if more than a few plans took longer than the budget or the period, or searches found no plan."""
