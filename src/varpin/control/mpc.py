@@ -17,6 +17,7 @@ from varpin.control.constraints import BoundRate
 from varpin.control.costs import CostError
 from varpin.control.history import Status
 from varpin.control.multipliers import REPORTED, ConstraintReport, Multipliers, at_nodes, flat
+from varpin.control.problem import require_problem
 from varpin.control.rollout import first_commands
 from varpin.control.search import Search
 from varpin.control.solving import searched
@@ -133,12 +134,11 @@ class MpcRun(Frozen):
 
     @property
     def _summary(self) -> str:
-        text = f"{len(self.plans)} ticks of {1e3 * self.period:.3g} ms"
-        if len(self.seconds) > 1:
-            milliseconds = 1e3 * self.seconds[1:]
+        text, took = f"{len(self.plans)} ticks of {1e3 * self.period:.3g} ms", 1e3 * self.seconds[1:]
+        if took.size:
             text += (
-                f": planning took {milliseconds.mean():.2f} ms in the mean, {np.quantile(milliseconds, 0.95):.2f} in "
-                f"95%, {milliseconds.max():.2f} at most, for {self.iterations[1:].mean():.2f} iterations a tick"
+                f": planning took {took.mean():.2f} ms in the mean, {np.quantile(took, 0.95):.2f} in 95%, "
+                f"{took.max():.2f} at most, for {self.iterations[1:].mean():.2f} iterations a tick"
             )
         if self.budget < np.inf:
             text += f"; {int(self.late.sum())} later than {1e3 * self.budget:.3g} ms"
@@ -163,15 +163,12 @@ class Mpc:
     evaluated at the plant's time: the horizon recedes. Costs and limits of changes of the controls start from the last
     applied control.
 
-    Where the problem's controls are linear between nodes, they follow the plan's first line over the tick. The next
-    plan's line begins at a control of its own, which reacts to the measured state at once; a
-    :class:`ControlRateCost` makes the jump between the two small.
+    Controls that are linear between nodes follow the plan's first line over the tick. The next plan's line begins at a
+    control of its own, which reacts to the measured state at once; a :class:`ControlRateCost` makes the jump small.
 
-    Constraints hold along every horizon, and moving obstacles are predicted. Each iteration of a tick meets their
-    linearization, so a plan satisfies them to the accuracy of few iterations, which ``Solution.violation`` has. A goal
-    (:class:`ReachFrame`) applies to the end of every horizon. The size of a margin is that of the first plan. After the
-    first plan constraints also hold in the middles of steps with ``between_nodes`` or linear controls, and else at the
-    nodes.
+    Constraints hold along every horizon to the accuracy of few iterations, which ``Solution.violation`` has; a goal
+    (:class:`ReachFrame`) applies to the end of every horizon. The size of a margin is that of the first plan. After it
+    constraints also hold in the middles of steps with ``between_nodes`` or linear controls, and else at the nodes.
 
     Main args:
         problem: The problem. Its horizon, discretization, noise, limits and constraints apply to every tick, its
@@ -192,25 +189,16 @@ class Mpc:
     budget: float = np.inf
 
     def __post_init__(self) -> None:
-        if not isinstance(self.problem, OptimalControlProblem):
-            raise InputError(f"problem must be an OptimalControlProblem, got {type(self.problem).__name__}")
+        require_problem(self.problem)
         count("iterations", self.iterations, least=1)
         positive("tolerance", self.tolerance, "1")
         if self.budget != np.inf:
             positive("budget", self.budget, "s")
 
-    def _repr_html_(self) -> str:
-        rows = [
-            ("period", f"{1e3 * self.period:.3g} ms"),
-            ("iterations", f"{self.iterations} a tick"),
-            ("budget", "any time" if self.budget == np.inf else f"{1e3 * self.budget:.3g} ms"),
-        ]
-        return facts("Model predictive control", rows, self.problem._repr_html_())
-
     @property
     def period(self) -> float:
         """Time of a tick: how long a decision is held, or the line between two decisions lasts [s]."""
-        return self.problem.dt * self.problem.hold
+        return self.problem.period
 
     def plan(
         self,
@@ -295,7 +283,6 @@ class Mpc:
             CostError: A custom cost fails; from the second tick on it holds the plant's motion so far.
             Interrupted: Ctrl-C; holds the plant's motion so far. In the first plan, a plain KeyboardInterrupt.
         """
-        told_motion("progress", progress, "ticks done, ticks in all", "nodes")
         plant = Plant(self.problem.scene) if plant is None else plant
         if not isinstance(plant, Plant):
             raise InputError(f"plant must be a varpin.Plant, for example varpin.Plant(scene), got {plant!r}")
@@ -361,6 +348,7 @@ class _Loop:
     def __init__(self, controller: Mpc, plant: Plant, ticks: int, progress: Progress | None) -> None:
         self.controller, self.problem, self.plant = controller, controller.problem, plant
         self.count, self.progress = ticks, progress
+        self.moving = told_motion("progress", progress, "ticks done, ticks in all", "nodes")
         self.ticks = [_Tick(solve(self.problem, tolerance=controller.tolerance))]
         plan = self.ticks[0].plan
         if plan.status is Status.INTERRUPTED or any(told.kind == "interrupted" for told in plan.warnings):
@@ -384,8 +372,7 @@ class _Loop:
         told: Any = self.progress
         nodes, self.nodes = Nodes(*map(np.array, zip(*self.nodes, (t, q, v), strict=True))), []
         if told is not None:
-            moving = told_motion("progress", told, "ticks done, ticks in all", "nodes")
-            told(len(self.ticks), self.count, *([nodes] if moving else []))
+            told(len(self.ticks), self.count, *([nodes] if self.moving else []))
 
     def replan(self, t: float, q: Floats, v: Floats) -> None:
         """Plan from the present state; where there is no plan in time, the one before acts on."""

@@ -74,15 +74,12 @@ _GRID = ("dt", "steps", "integrator", "sampling", "hold", "controls", "between_n
 
 @dataclass(frozen=True, eq=False, init=False)
 class OptimalControlProblem(Frozen):
-    """Minimize the expected cost of a motion from (q0, v0) over the controls, each held over ``hold`` steps.
+    """Minimize the expected cost of a motion from (q0, v0), (O1), over the controls, each held over ``hold`` steps.
 
-    The expected cost is (O1). With ``controls="linear"`` controls are linear in time between the nodes, with one
-    decision at each node, the first one included. Smooth motions then need a fraction of the nodes. Limits hold at the
-    nodes, and so everywhere.
-
-    Running costs are integrals in time, sampled in each step, and references are functions of time, so the problem is
-    the same at every ``dt``. Controls stay within their limits, feedback included. Costs add up, and numbers scale
-    them:
+    With ``controls="linear"`` controls are linear in time between the nodes, with one decision at each node, the first
+    one included. Smooth motions then need a fraction of the nodes. Controls stay within their limits, feedback
+    included. Running costs are integrals in time, and references are functions of time, so the problem is the same at
+    every ``dt``. Costs add up, and numbers scale them:
 
         cost = vp.TrackingCost(reference, 10.0) + vp.ControlCost(0.1) + vp.Terminal(2.0 * vp.TrackingCost(goal))
 
@@ -102,17 +99,15 @@ class OptimalControlProblem(Frozen):
             ``Gauss(stages=4)``. All with ``kick="held"`` where the scene has noise.
         sampling: Where in each step running costs are sampled. ``"gauss"``, the default: at its two Gauss points, with
             a cubic motion between the nodes, of fourth order; at four points where a :class:`varpin.KinematicInput` is
-            cubic. ``"midpoint"``: at ((q + q')/2, (q' - q)/dt, u), of second order; it is blind to velocities that
-            alternate from node to node, as optimal ones often do. ``"start"``: at the step's first node, a left sum as
-            in the paper, of first order.
+            cubic. ``"midpoint"``: at ((q + q')/2, (q' - q)/dt, u), of second order, and blind to velocities that
+            alternate from node to node. ``"start"``: at the step's first node, as in the paper, of first order.
         hold: Steps that share one control: a digital controller's period over the integrator's step.
         t0: Time at the beginning of the horizon [s], for references that are functions of time.
         control_limits: Least and greatest control (2, m) [N m or N per unit of control], infinite where there is none;
             of a :class:`varpin.KinematicInput` its positions at nodes.
         controls: ``"held"``, each constant over ``hold`` steps, or ``"linear"`` in time between nodes.
         constraints: Hard constraints on the motion (:class:`PlanConstraint`): joint limits, a frame's goal, regions,
-            clearance. The constraints of a :class:`Scene` differ: they belong to the mechanism, and constraint forces
-            maintain them in every motion.
+            clearance. Those of a :class:`Scene` belong to the mechanism.
         between_nodes: Whether the constraints are to hold between nodes, too, which takes more time. Linear controls
             keep them there anyway, to a thousandth of their range.
         integrator_by_default: Whether ``integrator`` was left out; :meth:`at` then chooses it anew.
@@ -168,11 +163,9 @@ class OptimalControlProblem(Frozen):
 
         Raises:
             UnknownJoint: An unknown joint name, or one of a joint that is not driven, for controls.
-            InputError: Wrong shapes, values that are not finite, not two of ``dt``, ``steps`` and ``duration``, a
-                duration that is no multiple of ``dt``, steps that are no multiple of ``hold``, a reference that does
-                not fit the problem's grid, or a lower limit above the upper one; linear controls with ``hold``;
-                ``hold`` with a :class:`KinematicInput`; another ``sampling`` than "gauss" with a cubic one, or with
-                linear controls; constraints that are no plan constraints or of another robot.
+            InputError: Wrong shapes or values; not two of ``dt``, ``steps`` and ``duration``; ``hold`` with linear
+                controls or a :class:`KinematicInput`; another ``sampling`` than "gauss" with linear controls or a cubic
+                input; a reference that does not fit the grid; constraints that are of another robot.
             CostError: A reference function fails.
             AssemblyError: The scene's constraints cannot be satisfied near q0.
         """
@@ -626,6 +619,13 @@ class OptimalControlProblem(Frozen):
     def expand_terminal(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the terminal costs at the end of a motion, in (q, v, u)."""
         return self.terminal.expand(*self._end(trajectory.q, trajectory.v))
+
+
+def require_problem(problem: object) -> OptimalControlProblem:
+    """``problem`` itself; an InputError if it is no OptimalControlProblem."""
+    if not isinstance(problem, OptimalControlProblem):
+        raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
+    return problem
 
 
 def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:

@@ -17,7 +17,7 @@ from varpin.control.history import Iteration, Refinement, SearchState, Status
 from varpin.control.monte_carlo import MonteCarlo, monte_carlo
 from varpin.control.multipliers import ConstraintReport, Multipliers, reports
 from varpin.control.noise import left_within_steps
-from varpin.control.problem import OptimalControlProblem
+from varpin.control.problem import OptimalControlProblem, require_problem
 from varpin.control.solution_file import read, write
 from varpin.control.stages import Feedback, Steps
 from varpin.control.verification import Verification, verify
@@ -182,9 +182,7 @@ class Solution(Frozen):
             FileError: The file is missing, truncated, no npz, written by something else, holds pickled objects, arrays
                 that do not fit together or are not finite, or is of another problem.
         """
-        if not isinstance(problem, OptimalControlProblem):
-            raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
-        return read(cls, path, problem)
+        return read(cls, path, require_problem(problem))
 
     def shifted(
         self, decisions: int, before: JointValues | None = None, x: Literal["momentum", "velocity"] | None = None
