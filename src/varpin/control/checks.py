@@ -28,7 +28,7 @@ from varpin.control.noise import covariances, noise_cost
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
 from varpin.control.stages import Feedback, Steps
-from varpin.control.verification import Played, at_start, excess, in_parts, percent, played
+from varpin.control.verification import CLEAR, Played, at_start, excess, in_parts, percent, played
 from varpin.errors import VarpinError
 from varpin.finding import Finding, announce, ranked
 from varpin.linearization import wrong_variances
@@ -55,9 +55,9 @@ logger = logging.getLogger(__name__)
 
 # Parts of a step in which a plan is played again.
 PARTS = 4
-# Greatest relative excess over the plan's cost, and shortfall, in parts of its steps without a warning. The latter is
-# also the share of the torque that holds a posture which limits may be short of.
-LOSS, GAIN = 1e-3, 1e-2
+# Greatest relative excess over the plan's cost in parts of its steps without a warning; of a shortfall it is CLEAR, as
+# of the torque that holds a posture which limits may be short of.
+LOSS = 1e-3
 # Part of the expected cost by which noise may cost other than planned in half steps without a warning.
 _NOISE_OFF = 0.02
 # Standard deviation of a velocity, in widths of its dry friction, up to which tanh is linear to 6 %.
@@ -216,7 +216,7 @@ def _weights(problem: OptimalControlProblem) -> Iterator[Finding]:
         needed, (lower, upper) = closest_controls(scene, q), problem.control_limits
         beyond = np.maximum(needed - upper, lower - needed)
         joint = int(np.argmax(beyond))
-        if beyond[joint] > GAIN * abs(needed[joint]):
+        if beyond[joint] > CLEAR * abs(needed[joint]):
             sentence = (
                 f"control limits cannot hold the arm at rest at {where}: joint {names[joint]!r} needs "
                 f"{needed[joint]:.3g}, and its limits are {lower[joint]:.3g} and {upper[joint]:.3g}"
@@ -302,7 +302,7 @@ def _dearer(solution: Solution, again: Sequence[Played]) -> Finding | None:
     # Where the optimum costs nothing, the excess is relative to the cost at stake at the beginning.
     base = abs(solution.cost) + (1e-9 * first if np.isfinite(first) else 0.0)
     lost = [excess(base + own.cost - solution.cost, base) for own in again]
-    if -GAIN <= lost[1] <= LOSS:
+    if -CLEAR <= lost[1] <= LOSS:
         return None
     alone, fed = (percent(part) if np.isfinite(part) else "runs away" for part in lost)
     advice = f"problem.at(dt={problem.dt / PARTS:g}, hold={problem.hold * PARTS}) decides as often in finer steps"

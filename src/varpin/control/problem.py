@@ -60,7 +60,7 @@ Sampling = Literal["midpoint", "gauss", "start"]
 Shape = Literal["held", "linear"]
 
 # Greatest rate of dampers and dry friction, times the step, for a method that is not L-stable.
-_STIFF = 10.0
+STIFF = 10.0
 # Stages of the default integrator. Two match the cost's order; four resolve friction up to ten times as fast as the
 # step, for a third more time.
 STAGES = 4
@@ -636,7 +636,7 @@ def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
     steps of plans an impulse costs two to five times as much.
     """
     kick = usual_kick(scene)
-    if not scene.constraints and dt * rate_at_rest(scene, q0) > _STIFF:
+    if not scene.constraints and dt * rate_at_rest(scene, q0) > STIFF:
         return Radau(STAGES, kick=kick)
     if scene.constraints or scene.custom is not None:
         return Gauss(STAGES, kick=kick)

@@ -11,10 +11,9 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
-from varpin.control.problem import OptimalControlProblem
+from varpin.control.problem import STIFF, OptimalControlProblem
 from varpin.core.arrays import Commands
 from varpin.integrators import Gauss, Integrator, Radau, RungeKutta4
-from varpin.mechanics.scene import quiet
 from varpin.signals.commands import open_line, open_loop
 from varpin.signals.policy import LinearPolicy
 from varpin.simulation.record import rollout
@@ -27,12 +26,10 @@ logger = logging.getLogger(__name__)
 # A plan's policy on (q, p) or (q, v), in parts of its steps.
 Policy: TypeAlias = Callable[[Literal["momentum", "velocity"], int], LinearPolicy]
 
-# Relative accuracy of the costs above which nothing can be concluded about the plan.
-_UNKNOWN = 0.01
+# Relative difference of costs from which on it counts: above it nothing can be concluded from an inaccurate one.
+CLEAR = 0.01
 # Integrators of the continuous system: without and with fast damping, and with constraints of the scene.
 _USUAL, _FAST, _CLOSED = RungeKutta4(), Radau(3), Gauss(stages=3)
-# Damping is fast if its rate times the plan's step is greater. Up to twice that, both integrators take as long.
-_FASTER = 8.0
 _READING = (
     "how to read it: where feedback loses less than a percent, the plan holds; where it loses more, dt is too coarse "
     "(controls alone also lose much where a motion is unstable)"
@@ -104,7 +101,6 @@ class Verification:
         closed_loop_cost: Cost with feedback at the plan's own rate.
         open_loop_gap: Largest distance of the end from the plan's, in q, under the controls alone [rad or m].
         closed_loop_gap: The same with feedback.
-        defect: Largest distance in q of an accurately integrated step from the plan's [rad or m].
         substeps: Substeps of the accurate integration in one step of the plan.
         accuracy: Relative change over the last doubling of the substeps, of the cost that changed more. Infinite where
             no cost could be compared: all motions diverge, or they diverged with fewer substeps, or ``max_substeps``
@@ -121,7 +117,6 @@ class Verification:
     closed_loop_cost: float
     open_loop_gap: float
     closed_loop_gap: float
-    defect: float
     substeps: int
     accuracy: float
     integrator: str = str(_USUAL)
@@ -139,7 +134,7 @@ class Verification:
     @property
     def told(self) -> bool:
         """Whether the costs are known to a percent; if not, nothing can be concluded about the plan."""
-        return self.accuracy <= _UNKNOWN or self.decided or self._diverges
+        return self.accuracy <= CLEAR or self.decided or self._diverges
 
     @property
     def open_loop_loss(self) -> float:
@@ -181,8 +176,8 @@ class Verification:
         good = "all motions run away" if self._diverges else "how good the costs are is not known"
         if np.isfinite(self.accuracy):
             good = f"costs are good to {self.accuracy:.0e} of themselves"
-        off = f"a step is off by {self.defect:.2e} rad or m at most; {good} ({self.substeps} substeps a step, "
-        return [f"{off}{self.integrator})", self._reading, *map(str, self.constraints)]
+        how = f"{good} ({self.substeps} substeps a step, {self.integrator})"
+        return [how, self._reading, *map(str, self.constraints)]
 
     def _repr_html_(self) -> str:
         head, *rows = self._rows()
@@ -226,8 +221,8 @@ def verify(
     or the cost with feedback is surely greater than ``above``. Where the explicit method does not reach that because of
     fast dampers or dry friction, the L-stable one repeats the comparison.
     """
-    fastest = problem.dt * rate_at_rest(problem.scene, problem.q0)
-    members = (_FAST,) if fastest > _FASTER else (_USUAL, _FAST)
+    stiff = problem.dt * rate_at_rest(problem.scene, problem.q0) > STIFF
+    members = (_FAST,) if stiff else (_USUAL, _FAST)
     for integrator in (_CLOSED,) if problem.scene.constraints else members:
         parts, before = substeps, (np.nan, np.nan)
         while True:
@@ -252,7 +247,6 @@ def verify(
             closed_loop_cost=closed.cost,
             open_loop_gap=float(np.abs(opened.nodes[-1] - plan.q[-1]).max()),
             closed_loop_gap=float(np.abs(closed.nodes[-1] - plan.q[-1]).max()),
-            defect=_defect(problem, plan, parts, integrator),
             substeps=parts,
             accuracy=accuracy,
             integrator=str(integrator),
@@ -323,15 +317,3 @@ def in_parts(
     fed = policy("momentum" if variational else "velocity", parts)
     closed = fed.commands(problem.steps * parts, m, n, variational=variational, stage_times=times)
     return alone._replace(hold=problem.hold * parts), closed
-
-
-def _defect(problem: OptimalControlProblem, plan: Trajectory, substeps: int, integrator: Integrator) -> float:
-    """Largest distance in q between the plan's steps and accurate ones from the same nodes; NaN where one diverges."""
-    u = plan.u_nodes[1:] if problem.linear else plan.u
-    commands = open_loop(u)._replace(hold=substeps, own=1)
-    if problem.linear:
-        times = np.array(integrator.stage_times or (0.5,))
-        commands = commands._replace(before=plan.u_nodes[:-1].copy(), stage_times=times)
-    begins = plan.q[:-1].copy(), plan.v[:-1].copy()
-    found = integrator.motions(quiet(problem.scene), *begins, commands, problem.dt / substeps)
-    return np.nan if found is None else float(np.abs(found[0][:, -1] - plan.q[1:]).max(initial=0.0))
