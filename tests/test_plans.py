@@ -117,7 +117,7 @@ def test_ctrl_c_ends_the_look_and_not_the_plan(monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("varpin.control.checks._again", stop)
+    monkeypatch.setattr("varpin.control.checks.replays", stop)
     plan = vp.solve(small())
     assert plan.status.converged
     assert about(plan.warnings[0], "interrupted")

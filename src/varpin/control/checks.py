@@ -28,7 +28,7 @@ from varpin.control.noise import covariances, noise_cost
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
 from varpin.control.stages import Feedback, Steps
-from varpin.control.verification import CLEAR, Played, at_start, excess, in_parts, percent, played
+from varpin.control.verification import CLEAR, Played, at_start, excess, in_parts, percent, replays
 from varpin.errors import VarpinError
 from varpin.finding import Finding, announce, ranked
 from varpin.linearization import wrong_variances
@@ -79,15 +79,14 @@ def looked_at(solution: Solution) -> Solution:
 def findings(solution: Solution) -> tuple[Finding, ...]:
     """Findings about a plan: its limits, its noise, and its cost and constraints within steps."""
     problem, motion = solution.problem, solution.trajectory
-    policy = solution.policy_on("momentum" if problem.integrator.variational else "velocity")
-    of_motion = check(problem.scene, problem.integrator, motion, policy).warnings
+    of_motion = check(problem.scene, problem.integrator, motion, solution.policy).warnings
     found = [*foreseen(problem), *(finding for finding in of_motion if finding.kind != "error")]
     met = solution.refinement is not None and solution.refinement.met
     if solution.refinement is not None and not met:
         found.append(Finding("true cost", solution.refinement.reason))
     found += _noise(solution)
     try:
-        again = _again(solution)
+        again = replays(problem, solution.controls, solution.policy_on, problem.integrator, PARTS)
     except VarpinError as error:
         return *found, Finding("replay", f"the plan cannot be replayed in steps of {1.0 / PARTS:g} dt: {error}")
     found += _between(solution, again)
@@ -278,21 +277,6 @@ def _lengths(constraint: PlanConstraint) -> dict[str, float]:
 
 
 # The finished plan
-
-
-def _again(solution: Solution) -> list[Played]:
-    """A plan in parts of its steps, without noise: under its controls alone, and with feedback at its own rate.
-
-    The integrator is the plan's, whose error falls with its order. :meth:`Solution.verify` does the same to many
-    digits, in more time.
-
-    Raises:
-        VarpinError: A custom cost or noise field fails off the plan.
-    """
-    problem, by = solution.problem, solution.problem.integrator
-    fine = problem.in_parts(PARTS)
-    commands = in_parts(problem, solution.controls, solution.policy_on, by, PARTS)
-    return [played(problem, fine, each, by) for each in commands]
 
 
 def _dearer(solution: Solution, again: Sequence[Played]) -> Finding | None:

@@ -463,7 +463,7 @@ class OptimalControlProblem(Frozen):
         u: Floats,
         gains: Floats,
         reference: Floats,
-        on: Literal["momentum", "velocity"],
+        on: Literal["momentum", "velocity"] | None,
         *,
         substeps: int = 1,
         **options: Any,

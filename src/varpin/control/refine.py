@@ -129,7 +129,7 @@ def _beyond(found: Verification) -> str:
 
 def _motion_of(coarse: Solution, problem: OptimalControlProblem) -> Trajectory:
     """The motion of a plan in half its steps."""
-    return problem.simulate(coarse.policy_on("momentum" if problem.integrator.variational else "velocity", 2))
+    return problem.simulate(coarse.policy_on(substeps=2))
 
 
 def _halved(problem: OptimalControlProblem) -> tuple[OptimalControlProblem | None, str]:

@@ -36,20 +36,9 @@ from varpin.trajectory import Trajectory
 class Solution(Frozen):
     """The best motion a solver found, with the policy around it.
 
-    ``print(plan.table())`` shows a row for each iteration, then how the search ended and why:
-
-    ========== =====================================================================================
-    iter       Number of the iteration, from 0.
-    cost       Cost of the motion after the iteration, without noise.
-    noise cost Cost added by noise to the motion before the iteration, by the solver's model.
-    expected   Decrease of the expected cost by the quadratic model for a full step.
-    decrease   Actual decrease; near the expected one where the model is good.
-    grad       Largest entry of the expected cost's gradient in the controls.
-    reg        Regularization, relative to the diagonal of Quu; 0 where the model needs none.
-    step       Length of the accepted step, 0 where there is none, as at the end; above 1 where the cost
-               falls on beyond the model's minimum.
-    trials     Number of trials of the line search; * stands for second derivatives of the dynamics.
-    ========== =====================================================================================
+    ``print(plan.table())`` shows a row for each :class:`Iteration`, with a * where second derivatives of the dynamics
+    count, then how the search ended and why. A step of 0 is none, as at the end; one above 1 went beyond the model's
+    minimum.
 
     ``print(plan.verify())`` shows the plan's cost on the continuous system, ``print(plan.monte_carlo(200, rng=0))`` its
     cost under the scene's noise.
@@ -127,7 +116,7 @@ class Solution(Frozen):
     @property
     def policy(self) -> LinearPolicy:
         """Controls with feedback, on the x of the problem's integrator."""
-        return self.policy_on(self._x)
+        return self.policy_on()
 
     def __repr__(self) -> str:
         noise = f" + {self.noise_cost:.4g} by noise" if self.noise_cost else ""
@@ -201,13 +190,12 @@ class Solution(Frozen):
         """
         if not 0 <= count("decisions", decisions) < len(self.gains):
             raise InputError(f"decisions must be from 0 to {len(self.gains) - 1}, got {decisions}")
-        on = x or self._x
-        policy, motion, N = self.policy_on(on), self.trajectory, self.problem.decisions - self.problem.linear
+        policy, motion, N = self.policy_on(x), self.trajectory, self.problem.decisions - self.problem.linear
         later = np.arange(N) + decisions
         rows = np.minimum(later, N - 1)
         u, reference, expected = policy.u[rows], policy.reference[rows], policy.u[:0]
         if self.problem.linear:
-            second = motion.p if on == "momentum" else motion.v
+            second = motion.p if policy.on == "momentum" else motion.v
             reference = np.where((later >= N)[:, None], np.append(motion.q[-1], second[-1]), reference)
             rows = np.where(later >= N, N // 2, rows)
             expected = self.controls[decisions, None]
@@ -217,15 +205,11 @@ class Solution(Frozen):
         previous_gains = None if policy.previous_gains is None else policy.previous_gains[rows]
         # A repeated control has itself as its previous one.
         previous = None if previous_gains is None else np.vstack([expected, u[:-1]])
-        given = u, policy.gains[rows], reference, on
+        given = u, policy.gains[rows], reference, policy.on
         return self.problem.policy_of(*given, before=before, previous_gains=previous_gains, previous=previous)
 
-    @property
-    def _x(self) -> Literal["momentum", "velocity"]:
-        return "momentum" if self.problem.integrator.variational else "velocity"
-
-    def policy_on(self, x: Literal["momentum", "velocity"], substeps: int = 1) -> LinearPolicy:
-        """The policy on (q, p) or on (q, v), each control held over ``substeps`` times as many steps.
+    def policy_on(self, x: Literal["momentum", "velocity"] | None = None, substeps: int = 1) -> LinearPolicy:
+        """The policy on (q, p) or on (q, v), by default the integrator's, over ``substeps`` times as many steps.
 
         A simulation needs no ``substeps``: it derives them from its dt and the policy's period.
 
@@ -234,6 +218,8 @@ class Solution(Frozen):
         Raises:
             InputError: ``x`` is neither "momentum" nor "velocity".
         """
+        own: Literal["momentum", "velocity"] = "momentum" if self.problem.integrator.variational else "velocity"
+        x = own if x is None else x
         word("x", x, ("momentum", "velocity"))
         gains, trajectory, hold = self.gains, self.trajectory, self.problem.hold
         rows, n = slice(0, -1, hold), self.problem.scene.robot.dof
@@ -242,7 +228,7 @@ class Solution(Frozen):
             # The first control is the value at the beginning of the first line.
             gains = gains[1:]
             previous_gains = None if previous_gains is None else previous_gains[1:]
-        if self.problem.integrator.variational != (x == "momentum"):
+        if x != own:
             rates = velocity_at_nodes(self.problem.scene, trajectory.q[rows], trajectory.v[rows])
             by_q, by_p = rates[:, :, :n], rates[:, :, n:]
             second = gains[:, :, n:]

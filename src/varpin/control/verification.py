@@ -228,9 +228,7 @@ def verify(
         while True:
             if progress is not None:
                 progress(parts, max_substeps)
-            fine = problem.in_parts(parts)
-            commands = in_parts(problem, problem.decided(plan), policy, integrator, parts)
-            opened, closed = (played(problem, fine, each, integrator) for each in commands)
+            opened, closed = replays(problem, problem.decided(plan), policy, integrator, parts)
             changes = [
                 abs(now.cost - then) / max(abs(now.cost), np.finfo(float).tiny)
                 for now, then in zip((opened, closed), before, strict=True)
@@ -270,6 +268,19 @@ def _violations(
         )
         for bound, (own, alone, fed) in zip(problem.bound_constraints, both, strict=True)
     )
+
+
+def replays(
+    problem: OptimalControlProblem, controls: Floats, policy: Policy, integrator: Integrator, parts: int
+) -> tuple[Played, Played]:
+    """A plan in parts of its steps, without noise: under its controls alone, and with feedback at its own rate.
+
+    Raises:
+        VarpinError: A custom cost or noise field fails off the plan.
+    """
+    fine = problem.in_parts(parts)
+    opened, closed = in_parts(problem, controls, policy, integrator, parts)
+    return played(problem, fine, opened, integrator), played(problem, fine, closed, integrator)
 
 
 def played(
