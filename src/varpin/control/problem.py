@@ -325,7 +325,8 @@ class OptimalControlProblem(Frozen):
         if before is not None:
             control = control_values("before", before, self.scene.control_joints, self.scene.controls)
             given["cost"] = with_control_before(given.get("cost", self.cost), control)
-            given["constraints"] = tuple(item.after(control) for item in given.get("constraints", self.constraints))
+            kept = tuple_of("constraints", given.get("constraints", self.constraints), PlanConstraint)
+            given["constraints"] = tuple(item.after(control) for item in kept)
         if moves:
             return self._moved(given)
         same = {name: getattr(self, name) for name in (*_MOVED, *_GRID, "cost", "constraints", "control_limits")}
