@@ -216,7 +216,7 @@ def test_paths_that_were_finished_before_a_worker_was_lost_are_kept():
 
 def failing(task):
     if task == 2:
-        raise vp.UnknownJoint("elbow", ("knee",), "a robot")
+        raise vp.UnknownJoint("elbow", ("knee",), "no joint")
     return task
 
 

@@ -348,7 +348,7 @@ def _one(where: Where, given: Any) -> Robot:
         if isinstance(error.__context__, RobotNotFound):
             raise where.at("source").error(error.problem) from None
         if isinstance(error.__context__, UnknownFrame):
-            index = [load.frame for load in own["payload"]].index(error.__context__.frame)
+            index = [load.frame for load in own["payload"]].index(error.__context__.name)
             raise where.at("payload", index, "frame").error(error.problem) from None
         raise
 
