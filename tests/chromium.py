@@ -8,10 +8,13 @@ import re
 import time
 
 import numpy as np
+import pinocchio as pin
 import umsgpack
 from PIL import Image
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
+
+from varpin.model import geometry
 
 FLAGS = [
     "--headless",
@@ -112,6 +115,31 @@ def shape_poses(browser, figure="robot"):
         figure,
     )
     return {int(k): np.array(pose).reshape(4, 4).T for k, pose in poses.items()}
+
+
+def shapes_stand(browser, robot, q, figure="robot", shift=0.0):
+    """Whether every shape of a robot, or every moving one of its ghost, is where Pinocchio puts it, and shifted."""
+    model, shapes = robot.free_model, geometry(robot)
+    data, placements = model.createData(), shapes.createData()
+    pin.updateGeometryPlacements(model, data, shapes, placements, robot.free_positions(np.asarray(q)))
+    poses = shape_poses(browser, figure)
+    moving = [k for k, shape in enumerate(shapes.geometryObjects) if shape.parentJoint > 0]
+    assert sorted(poses) == (moving if figure.startswith("ghost") else list(range(shapes.ngeoms)))
+    off = [poses[k] - placements.oMg[k].homogeneous for k in poses]
+    return np.abs(off - np.pad(np.reshape(shift, (-1, 1)) * np.ones((3, 1)), ((0, 1), (3, 0)))).max() < 2e-5
+
+
+def severe(browser):
+    """Errors of the page, but for the icon that a server has not."""
+    entries = browser.get_log("browser")
+    return [entry for entry in entries if entry["level"] == "SEVERE" and "favicon" not in entry["message"]]
+
+
+def names(browser, path):
+    """The nodes below a path."""
+    return browser.execute_script(
+        "return Object.keys(viewer.scene_tree.find(['meshcat', ...arguments[0]]).children)", path
+    )
 
 
 def commands(path):

@@ -518,7 +518,6 @@ def clear(robot, **options):
         (lambda r, s: vp.LiveView(r, open="no"), ("open", "'no'")),
         (lambda r, s: vp.replay(r, ARRAY, open="no"), ("open", "'no'")),
         (lambda r, s: vp.replay(r, ARRAY, html="x.html", marks=vp.Marks(growing=ARRAY)), "growing"),
-        (lambda r, s: vp.plots.plot_energy_error(vp.simulate(s, *REST, **FREE), relative="no"), ("relative", "'no'")),
     ],
 )
 def test_what_is_no_flag_function_list_or_record(robot, call, facts):

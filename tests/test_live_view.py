@@ -5,26 +5,19 @@ import logging
 import time
 
 import numpy as np
-import pinocchio as pin
 import pytest
-from chromium import shape_poses, wait_until
+from chromium import names, severe, shapes_stand, wait_until
 from refusals import refused
 
 import varpin as vp
-from varpin.model import geometry
 from varpin.show.replay import live, page
 
 ONLINE = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
 
 
 @pytest.fixture(scope="module")
-def chain():
-    return vp.planar_chain(2)
-
-
-@pytest.fixture(scope="module")
-def scene(chain):
-    return vp.Scene(chain)
+def scene():
+    return vp.Scene(vp.planar_chain(2))
 
 
 @pytest.fixture
@@ -56,28 +49,6 @@ def seen(opened, browser):
     return make
 
 
-def stands(browser, robot, q):
-    """Whether every shape on the page is where Pinocchio puts it."""
-    model, shapes = robot.free_model, geometry(robot)
-    data, placements = model.createData(), shapes.createData()
-    pin.updateGeometryPlacements(model, data, shapes, placements, robot.free_positions(np.asarray(q)))
-    poses = shape_poses(browser)
-    assert sorted(poses) == list(range(shapes.ngeoms))
-    return all(np.allclose(poses[k], placements.oMg[k].homogeneous, atol=1e-4) for k in poses)
-
-
-def names(browser, *path):
-    """Of what is below a node."""
-    return browser.execute_script(
-        "return viewer.scene_tree.find(['meshcat', ...arguments[0]]).object.children.map(child => child.name)", path
-    )
-
-
-def severe(browser):
-    entries = browser.get_log("browser")
-    return [e for e in entries if e["level"] == "SEVERE" and "favicon" not in e["message"]]
-
-
 def test_the_robot_is_where_the_motion_is_while_it_is_computed(seen, browser):
     finger = vp.load_robot("finger")
     scene = vp.Scene(finger, gravity=False, damping=1e-3)
@@ -87,15 +58,15 @@ def test_the_robot_is_where_the_motion_is_while_it_is_computed(seen, browser):
     def progress(done, steps, nodes):
         view.progress(done, steps, nodes)
         if len(looks) < 4 or done == steps:
-            wait_until(lambda: stands(browser, finger, nodes.q[-1]))
+            wait_until(lambda: shapes_stand(browser, finger, nodes.q[-1]))
             looks.append(done)
 
     vp.simulate(scene, [0.1, 0.2, 0.3], [2.0, 1.0, 1.0], dt=1e-5, steps=60_000, progress=progress)
     assert looks[0] == 0
     assert looks[-1] == 60_000
     assert 0 < looks[1] < looks[2] < looks[3] < 60_000
-    assert any("tip" in name or finger.end_effector in name for name in names(browser, "notes", "live"))
-    assert "words" in names(browser, "notes")
+    assert any("tip" in name or finger.end_effector in name for name in names(browser, ["notes", "live"]))
+    assert "words" in names(browser, ["notes"])
     assert severe(browser) == []
 
 
@@ -117,7 +88,7 @@ def test_a_motion_takes_the_time_that_it_would_take(opened, scene, monkeypatch):
     assert shown[-1] == end
 
 
-def test_a_controllers_run_is_shown(opened, chain, scene):
+def test_a_controllers_run_is_shown(opened, scene):
     cost = vp.TrackingCost([0.5, -1.0], 10.0) + vp.VelocityCost(0.1) + vp.ControlCost(1e-4)
     problem = vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], dt=2e-2, steps=20)
     view = opened(problem, speed=None)
@@ -133,8 +104,8 @@ def test_a_controllers_run_is_shown(opened, chain, scene):
     np.testing.assert_array_equal(view._q, run.motion.q[-1])
 
 
-def test_the_camera_moves_back_from_what_leaves_the_view(opened, chain):
-    view = opened(chain)
+def test_the_camera_moves_back_from_what_leaves_the_view(opened, scene):
+    view = opened(scene.robot)
     before = view._in_view
     view._keep_in_view(np.array([[9.0, 0.0, 0.0]]))
     assert view._in_view.max() > 10.0
@@ -184,7 +155,7 @@ def test_a_browser_is_started_and_waited_for(scene, monkeypatch, caplog, capfd):
     vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=10, progress=view.progress)
 
 
-def test_says_what_does_not_fit(opened, chain, scene):
+def test_says_what_does_not_fit(opened, scene):
     view = opened(scene)
     problem = vp.OptimalControlProblem(scene, vp.ControlCost(1.0), [0.0, 0.0], [0.0, 0.0], dt=1e-2, steps=5)
     with refused(vp.InputError, "progress"):
@@ -194,7 +165,7 @@ def test_says_what_does_not_fit(opened, chain, scene):
     with refused(vp.InputError, "'chain2'", "2", "3"):
         vp.simulate(vp.Scene(vp.planar_chain(3)), np.zeros(3), np.zeros(3), dt=1e-3, steps=10, progress=view.progress)
     with refused(vp.InputError, "LiveView", "Robot", "Scene", "OptimalControlProblem"):
-        vp.LiveView(chain.model)
+        vp.LiveView(scene.robot.model)
     with refused(vp.UnknownFrame, "trace", "'chain2'", "'hand'"):
         vp.LiveView(scene, marks=vp.Marks(trace="hand"))
     with refused(vp.InputError, "speed", "0.0"):

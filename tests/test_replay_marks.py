@@ -6,13 +6,12 @@ import re
 import numpy as np
 import pinocchio as pin
 import pytest
-from chromium import animation, commands, picture, seek, shape_poses, visit
+from chromium import animation, commands, names, picture, seek, severe, shape_poses, shapes_stand, visit
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
 import varpin as vp
 from varpin import replay
-from varpin.model import geometry
 
 TIP = "tool0"
 
@@ -60,13 +59,6 @@ def vertices(browser, path):
     return np.array(numbers).reshape(-1, 3)
 
 
-def names(browser, path):
-    """The nodes below a path."""
-    return browser.execute_script(
-        "return Object.keys(viewer.scene_tree.find(['meshcat', ...arguments[0]]).children)", path
-    )
-
-
 def pose(browser, path):
     """A node's transform (4, 4) in the world of meshcat's root."""
     numbers = browser.execute_script(
@@ -85,10 +77,6 @@ def along(browser, name, root="notes"):
     return vertices(browser, [root, name]).reshape(-1, 6, 3).mean(axis=1)
 
 
-def assert_no_errors(browser):
-    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
-
-
 def farthest(points, path):
     """The largest distance of points (P, 3) from a densely sampled path (K, 3)."""
     return max(np.linalg.norm(path - point, axis=1).min() for point in points)
@@ -100,7 +88,7 @@ def test_traces_are_where_pinocchio_puts_the_frame(browser, arm, sweep, tmp_path
     # A frame that stays leaves no trace.
     marks = vp.Marks(trace=[TIP, "wrist_1_link", "base_link"], reference={"corner": reference}, ghost=ghost)
     visit(browser, replay(arm, sweep, dt=0.05, marks=marks, html=tmp_path / "traces.html"))
-    assert_no_errors(browser)
+    assert severe(browser) == []
     assert len(names(browser, ["notes"])) == 5
     fine = np.arange(0.0, 20.0 + 1e-9, 0.01)
 
@@ -159,7 +147,7 @@ def test_a_growing_trace_is_drawn_as_far_as_the_motion_has_come(browser, arm, sw
             lengths.append(drawn)
         assert lengths[0] == 0.0
         assert lengths[-1] == pytest.approx(36.0 * (len(points) - 1))
-    assert_no_errors(browser)
+    assert severe(browser) == []
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +163,7 @@ def test_a_controllers_run_shows_its_plans(browser, run, tmp_path):
     robot = run.plans[0].problem.scene.robot
     tip = robot.end_effector
     visit(browser, replay(robot, run, html=tmp_path / "run.html", marks=vp.Marks(trace=True, ahead=0.24), fps=1000.0))
-    assert_no_errors(browser)
+    assert severe(browser) == []
     assert names(browser, ["notes"]) == [f"0 motion {tip}", f"1 plan {tip}"]
     root, beads = ["notes", f"1 plan {tip}"], 12
     assert len(names(browser, root)) == beads
@@ -224,7 +212,7 @@ def test_targets_stand_or_move(browser, arm, sweep, tmp_path):
     }
     page = replay(arm, sweep, dt=0.05, speed=0.5, html=tmp_path / "targets.html", marks=vp.Marks(targets=targets))
     visit(browser, page)
-    assert_no_errors(browser)
+    assert severe(browser) == []
     nodes = {name: ["notes", f"{k} target {name}"] for k, name in enumerate(targets)}
     assert names(browser, ["notes"]) == [path[-1] for path in nodes.values()]
     half = pin.SE3(turn.as_matrix(), np.array([0.3, 0.2, 0.3]))
@@ -276,7 +264,7 @@ def test_links_take_the_colour_of_their_torque(browser, tmp_path):
     controls = np.array([[4.0, 0.5], [9.0, -2.0]])
     motion = vp.simulate(vp.Scene(robot, damping=9.0), np.zeros(2), np.zeros(2), dt=0.01, steps=2, controls=controls)
     visit(browser, replay(robot, motion, html=tmp_path / "torques.html", marks=vp.Marks(torques=True)))
-    assert_no_errors(browser)
+    assert severe(browser) == []
     for seconds, shares in [(0.0, [0.5, 0.25]), (0.02, [1.0, 1.0])]:
         seek(browser, seconds)
         colors = browser.execute_script(
@@ -296,26 +284,23 @@ def test_links_take_the_colour_of_their_torque(browser, tmp_path):
 
 def test_robots_side_by_side_keep_their_own_motions(browser, tmp_path):
     finger = vp.load_robot("finger")
-    shapes, model, tip = geometry(finger), finger.free_model, finger.end_effector
+    tip = finger.end_effector
     bend = np.linspace([0.0, 0.0, 0.0], [1.0, 1.2, 1.4], 21)
     # The last one's motion is over after 0.25 s, and held.
     motions = [bend, bend[::-1], bend[:6]]
     marks = vp.Marks(trace=True, targets={"goal": [0.1, 0.0, 0.1]})
     page = replay([(finger, q) for q in motions], dt=0.05, html=tmp_path / "three.html", marks=marks)
     visit(browser, page)
-    assert_no_errors(browser)
+    assert severe(browser) == []
     seek(browser, 0.75)
     aside, spans = pose(browser, ["robot 2"])[:3, 3], []
     for k, q in enumerate([bend[15], bend[5], bend[5]]):
         number = f" {k + 1}" if k else ""
-        shift, points = pose(browser, [f"robot{number}"])[:3, 3], []
-        at, data = shapes.createData(), model.createData()
-        pin.updateGeometryPlacements(model, data, shapes, at, finger.free_positions(q))
-        for index, found in shape_poses(browser, f"robot{number}").items():
-            np.testing.assert_allclose(found[:3, 3], at.oMg[index].translation + shift, atol=2e-5)
-            points.append(found[:3, 3])
+        shift = pose(browser, [f"robot{number}"])[:3, 3]
+        points = [found[:3, 3] for found in shape_poses(browser, f"robot{number}").values()]
+        assert shapes_stand(browser, finger, q, f"robot{number}", shift)
         goal = pose(browser, [f"notes{number}", names(browser, [f"notes{number}"])[-1]])[:3, 3]
-        np.testing.assert_allclose(goal, [0.1, 0.0, 0.1, *shift], atol=1e-6)
+        np.testing.assert_allclose(goal, np.array([0.1, 0.0, 0.1]) + shift, atol=1e-6)
         begin = along(browser, f"0 motion {tip}", f"notes{number}")[0]
         np.testing.assert_allclose(begin, placements(finger, motions[k][0], tip)[0, :3, 3] + shift, atol=1e-5)
         spans.append(np.array([*points, begin, goal]) @ aside)
@@ -412,7 +397,7 @@ def test_ties_are_where_pinocchio_puts_the_points(browser, crank, tmp_path):
     scene, motion = crank
     page = replay(scene.robot, motion, marks=vp.Marks(constraints=scene), html=tmp_path / "crank.html", fps=100.0)
     visit(browser, page)
-    assert_no_errors(browser)
+    assert severe(browser) == []
     assert "constraint: PointOnPoint, PointOnPlane" in key(browser)
     nodes = ["robot", "joint1", "moving", "joint2", "moving", "notes"]
     kinds = ["0 constraint PointOnPoint", "1 constraint PointOnPlane", "2 constraint PointOnPlane"]
@@ -465,7 +450,7 @@ def test_obstacles_and_regions_have_their_sizes(browser, plan, tmp_path):
             robot, plan.trajectory.q[:1], dt=1.0, marks=vp.Marks(constraints=plan.problem), html=tmp_path / "plan.html"
         ),
     )
-    assert_no_errors(browser)
+    assert severe(browser) == []
     assert key(browser) == ["obstacle: post, crate, ball", "tip keeps out", "tip keeps in", "target: goal of tip"]
     *shown, goal = names(browser, ["notes"])
     found = {name: vertices(browser, ["notes", name]) for name in shown}

@@ -30,11 +30,7 @@ def problem_of(given: object) -> OptimalControlProblem | None:
 
 
 def frame_names(option: str, robots: Sequence[Robot], names: bool | str | Sequence[str]) -> list[tuple[str, ...]]:
-    """The frames of each robot: of the given names those it has; for True its end effector.
-
-    Raises:
-        InputError: They are no names, or, as UnknownFrame, no robot has a frame of that name; ``option`` is named.
-    """
+    """The frames of each robot: of the given names those it has; for True its end effector."""
     if isinstance(names, bool | np.bool_):
         return [(robot.end_effector,) if names else () for robot in robots]
     wanted = (names,) if isinstance(names, str) or not isinstance(names, Iterable) else tuple(names)

@@ -19,7 +19,6 @@ from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
 from varpin.show.given import motion_of, problem_of
-from varpin.support.checks import flag
 from varpin.trajectory import Trajectory, kinematic_input_rows, require_trajectory
 
 if TYPE_CHECKING:
@@ -84,13 +83,7 @@ def plot_velocities(
 def plot_error(
     trajectory: Motion, axes: Axes | None = None, *, robot: Robot | None = None
 ) -> tuple[Figure | SubFigure, Axes]:
-    """The estimated error of the joint positions over time, on a logarithmic axis.
-
-    The arguments are those of :func:`plot_joints`.
-
-    Raises:
-        InputError: As for :func:`plot_joints`, or the motion was not checked.
-    """
+    """The estimated error of q over time, of a checked motion; arguments as for :func:`plot_joints`."""
     trajectory = _require_motion(trajectory, robot)
     if trajectory.error is None:
         raise InputError("the motion has no error: it was simulated with check=False")
@@ -105,22 +98,11 @@ def plot_error(
 def plot_controls(
     trajectory: Motion, axes: Axes | None = None, *, robot: Robot | None = None
 ) -> tuple[Figure | SubFigure, Axes]:
-    """Controls over time: step functions, or lines where they are linear between nodes.
+    """Controls over time: step functions, or lines where they are linear between nodes; as :func:`plot_joints`.
 
     Controls of position servos and kinematic inputs are commanded positions [rad or m]; the second control of a cubic
-    input is a velocity [rad/s or m/s]. A control of several joints is named u1, u2, ...
-
-    Args:
-        trajectory: The motion, or a plan or a controller's run that has one.
-        axes: Where to draw; a new figure if left out.
-        robot: The robot of the motion. With it, labels have the units of the controls, N m or N, and limits near the
-            controls are dotted lines: efforts, or positions for servos. Those of a plan are its control limits.
-
-    Returns:
-        The figure and its axes.
-
-    Raises:
-        InputError: As for :func:`plot_joints`.
+    input is a velocity [rad/s or m/s]. A control of several joints is named u1, u2, ... Others are in N m or N; limits
+    are efforts, or positions for servos, or a plan's control limits.
     """
     problem, trajectory = problem_of(trajectory), _require_motion(trajectory, robot)
     limits, lines, joints = None, *_of_controls(trajectory, robot)
@@ -135,49 +117,19 @@ def plot_controls(
     return _draw(trajectory, trajectory.u_nodes if linear else trajectory.u, lines, axes, limits, steps=not linear)
 
 
-def plot_energy_error(
-    trajectory: Motion, axes: Axes | None = None, *, relative: bool = False
-) -> tuple[Figure | SubFigure, Axes]:
-    """Change of the energy over time, which is an error if no force drives or damps the robot.
-
-    Args:
-        trajectory: The motion, or a plan or a controller's run that has one.
-        axes: Where to draw; a new figure if left out.
-        relative: Divide by the initial energy, instead of plotting joules. The potential energy is zero at the world's
-            origin, so the result depends on the placement of the robot.
-
-    Returns:
-        The figure and its axes.
-
-    Raises:
-        InputError: ``relative`` is set and the initial energy is 0, or as for :func:`plot_joints`.
-    """
+def plot_energy_error(trajectory: Motion, axes: Axes | None = None) -> tuple[Figure | SubFigure, Axes]:
+    """Change of the energy [J], which is an error if no force drives or damps the robot; as :func:`plot_joints`."""
     trajectory = _require_motion(trajectory, None)
-    start = trajectory.energy[0]
-    if flag("relative", relative) and start == 0.0:
-        raise InputError("the initial energy is 0 J, so nothing is relative to it: plot with relative=False")
     figure, axes = _axes(axes)
-    change = (trajectory.energy - start) / (abs(start) if relative else 1.0)
-    label = "(E(t) - E(0)) / |E(0)| [1]" if relative else "E(t) - E(0) [J]"
     axes.axhline(0.0, color="0.75", linewidth=0.8, zorder=1)
+    change = trajectory.energy - trajectory.energy[0]
     axes.plot(trajectory.t, change, label="energy", color=COLORS[0], linewidth=1.2)
-    _finish(axes, trajectory, label)
+    _finish(axes, trajectory, "E(t) - E(0) [J]")
     return figure, axes
 
 
 def plot_trajectory(trajectory: Motion, *, robot: Robot | None = None) -> tuple[Figure, NDArray[Any]]:
-    """An overview: positions, velocities, controls and energy, one above the other.
-
-    Args:
-        trajectory: The motion, or a plan or a controller's run that has one.
-        robot: As for :func:`plot_joints`.
-
-    Returns:
-        The figure and its axes: four, or three where there are no controls or all are 0.
-
-    Raises:
-        InputError: As for the single figures.
-    """
+    """Positions, velocities, controls unless all are 0, and energy; arguments as for :func:`plot_joints`."""
     given, trajectory = trajectory, _require_motion(trajectory, robot)
     draw = [plot_joints, plot_velocities, *([plot_controls] if np.any(trajectory.u) else [])]
     figure = Figure(figsize=(9.0, 2.5 * (len(draw) + 1)), layout="constrained")
@@ -206,7 +158,7 @@ def _share_legend(figure: Figure, panels: NDArray[Any]) -> None:
 
 
 def plot_study(study: Study[Any], axes: Axes | None = None, **options: str) -> tuple[Figure | SubFigure, Axes]:
-    """What a study measured over time: a line for each method, circles and a line on the Pareto front.
+    """What a study measured over time: a line for each method, circles on the Pareto front.
 
     A grey line marks the error of the reference.
 
@@ -233,10 +185,7 @@ def plot_study(study: Study[Any], axes: Axes | None = None, **options: str) -> t
         curve = [(seconds, value) for label, seconds, value in chart.points if label == name]
         axes.plot(*zip(*curve, strict=True), label=name, marker="o", markersize=4, **style)
     ring: dict[str, Any] = {"marker": "o", "markersize": 9, "markerfacecolor": "none", "color": "0.3", "zorder": 1}
-    axes.plot(*zip(*chart.front, strict=True), linestyle="none", **ring)
-    # The line connects only the points whose error is below that of all faster ones.
-    front = [point for k, point in enumerate(chart.front) if all(point[1] < v for _, v in chart.front[:k])]
-    axes.plot(*zip(*front, strict=True), label="Pareto front", linewidth=0.8, **ring)
+    axes.plot(*zip(*chart.front, strict=True), label="Pareto front", linestyle="none", **ring)
     axes.set(xscale="log", yscale="log" if chart.logarithmic else "linear")
     for name, (axis, value) in chart.marks.items():
         (axes.axvline if axis == "x" else axes.axhline)(value, label=name, **_MARK)

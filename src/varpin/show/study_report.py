@@ -20,9 +20,6 @@ def write_report(folder: Path, name: str, study: Study[Any], title: str) -> list
     """Write ``name.csv``, ``name.png`` and ``name.html`` into an existing folder; returns their paths.
 
     The figure is left out if the study has none, or no run has the numbers for it.
-
-    Raises:
-        FileError: A file cannot be written.
     """
     image = _image(study)
     body = study.html(most=len(study.runs)) + (picture(image, title) if image else "")

@@ -42,23 +42,14 @@ NODES, START = 32, 4
 
 @dataclass(frozen=True, eq=False)
 class Exact:
-    """The exact motion at some nodes of a window.
+    """The exact motion at some nodes of a window."""
 
-    Attributes:
-        nodes: Their indices (K,).
-        q: (K, n) [rad or m].
-        v: (K, n) [rad/s or m/s].
-        travel: Largest distance from the start [rad or m].
-        travels: The same for each joint (n,) [rad or m].
-        speeds: Largest velocity of each joint (n,) [rad/s or m/s].
-    """
-
-    nodes: NDArray[np.int64]
-    q: Floats
-    v: Floats
-    travel: float
-    travels: Floats
-    speeds: Floats
+    nodes: NDArray[np.int64]  # their indices (K,)
+    q: Floats  # (K, n) [rad or m]
+    v: Floats  # (K, n) [rad/s or m/s]
+    travel: float  # largest distance from the start [rad or m]
+    travels: Floats  # the same for each joint (n,) [rad or m]
+    speeds: Floats  # largest velocity of each joint (n,) [rad/s or m/s]
 
     def errors(self, trajectory: Trajectory) -> dict[str, float]:
         """Largest distances of a motion, none if it ends before the first node.

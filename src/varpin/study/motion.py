@@ -37,47 +37,28 @@ _LONG = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """A timed run.
+    """A timed run."""
 
-    Attributes:
-        motion: Up to the step that failed, if one did.
-        failure: Why it did not get to the end; empty if it did.
-        seconds: Wall time, the best of the repetitions [s].
-    """
-
-    motion: Trajectory
-    failure: str
-    seconds: float
+    motion: Trajectory  # up to the step that failed, if one did
+    failure: str  # why it did not get to the end; empty if it did
+    seconds: float  # wall time, the best of the repetitions [s]
 
 
 @dataclass(frozen=True, eq=False)
 class Setting(Frozen):
-    """A motion to integrate.
+    """A motion to integrate."""
 
-    Attributes:
-        scene: Without noise.
-        q0: (n,) [rad or m].
-        v0: (n,) [rad/s or m/s].
-        controls: (R, m), each row held over duration / R; kinematic inputs reach their positions in that time.
-        duration: [s].
-    """
-
-    scene: Scene
-    q0: Floats
-    v0: Floats
-    controls: Floats
-    duration: float
+    scene: Scene  # without noise
+    q0: Floats  # (n,) [rad or m]
+    v0: Floats  # (n,) [rad/s or m/s]
+    controls: Floats  # (R, m), each row held over duration / R; kinematic inputs reach their positions in that time
+    duration: float  # [s]
 
     @classmethod
     def of(
         cls, scene: Scene, q0: JointValues, v0: JointValues, controls: JointValues | None, duration: float
     ) -> Setting:
-        """The setting of checked arguments. A start near constraints is moved onto them; the log has the distance.
-
-        Raises:
-            InputError: Wrong shapes or values, a scene with noise, controls that are a function.
-            AssemblyError: The scene's constraints cannot be kept next to q0.
-        """
+        """The setting of checked arguments. A start near constraints is moved onto them; the log has the distance."""
         joints = require_scene(scene).robot.joint_names
         if scene.processes:
             raise InputError("errors of single motions are compared here: leave the noise out of the scene")
@@ -144,11 +125,7 @@ def fastest(run: Callable[[], tuple[Result, float]], repeats: int, within: float
 
 
 def integrators_of(scene: Scene, integrators: Sequence[Integrator] | None) -> tuple[Integrator, ...]:
-    """The integrators to compare.
-
-    Raises:
-        InputError: None is given, one twice, or one that is no integrator, or does not keep the scene's constraints.
-    """
+    """The integrators to compare."""
     if integrators is None:
         return candidates(scene)
     if not isinstance(integrators, Iterable):

@@ -33,21 +33,14 @@ _HEADINGS = {
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """What a study's figure shows: a quantity over time.
+    """What a study's figure shows: a quantity over time."""
 
-    Attributes:
-        points: Method, wall time [s] and value of each run.
-        front: Wall time [s] and value of the runs on the Pareto front.
-        labels: Of the two axes.
-        marks: Values to mark, by name: the axis, x or y, and the value.
-        logarithmic: Whether the values are.
-    """
-
-    points: Sequence[tuple[str, float, float]]
-    front: Sequence[tuple[float, float]]
-    labels: tuple[str, str]
+    points: Sequence[tuple[str, float, float]]  # method, wall time [s] and value of each run
+    front: Sequence[tuple[float, float]]  # wall time [s] and value of the runs on the Pareto front
+    labels: tuple[str, str]  # of the two axes
+    # Values to mark, by name: the axis, x or y, and the value.
     marks: Mapping[str, tuple[str, float]] = field(default_factory=dict)
-    logarithmic: bool = True
+    logarithmic: bool = True  # whether the values are
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,50 +31,33 @@ EFFORT_COLORS = np.array([[0.72, 0.76, 0.8], [0.98, 0.75, 0.1], [0.8, 0.05, 0.05
 
 @dataclass(frozen=True, eq=False)
 class Actor:
-    """A robot that moves.
-
-    Attributes:
-        robot: The robot.
-        motions: Configurations at the keyframes (K, n) [rad or m], by "robot" and, if there is one, "ghost".
-        annotate: Makes the marks beside it.
-        effort: Torque of each joint of the tree as a share of its limit at the keyframes (K, b), in [0, 1]; None for
-            the robot in its own colours.
-    """
+    """A robot that moves."""
 
     robot: Robot
+    # Configurations at the keyframes (K, n) [rad or m], by "robot" and, if there is one, "ghost".
     motions: Mapping[str, Floats]
-    annotate: Callable[[Figure], Iterable[Mark]]
+    annotate: Callable[[Figure], Iterable[Mark]]  # makes the marks beside it
+    # Torque of each joint of the tree as a share of its limit at the keyframes (K, b), in [0, 1]; None for the robot
+    # in its own colours.
     effort: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """The contents of a replay, in their places.
+    """The contents of a replay, in their places."""
 
-    Attributes:
-        times: Times of the keyframes (K,) [s of playback]. All tracks share them: each track loops on its own, and
-            tracks of unequal length would drift apart.
-        actors: The robots.
-        figures: What their marks know of each.
-        marks: The marks of each.
-        places: Position of the world of each (3,) [m].
-        points: Points around everything that is shown (P, 3) [m].
-        toward: Unit vector (3,) to the camera.
-        size: Size of the largest robot's motion [m].
-        speed: Seconds of motion in a second of playback.
-        error: The estimated error of the motions in words; empty where it is not known.
-    """
-
+    # Times of the keyframes (K,) [s of playback]. All tracks share them: each track loops on its own, and tracks of
+    # unequal length would drift apart.
     times: Floats
     actors: Sequence[Actor]
-    figures: list[Figure]
+    figures: list[Figure]  # what their marks know of each
     marks: list[list[Mark]]
-    places: list[Floats]
-    points: Floats
-    toward: Floats
-    size: float
-    speed: float
-    error: str
+    places: list[Floats]  # position of the world of each (3,) [m]
+    points: Floats  # points around everything that is shown (P, 3) [m]
+    toward: Floats  # unit vector (3,) to the camera
+    size: float  # size of the largest robot's motion [m]
+    speed: float  # seconds of motion in a second of playback
+    error: str  # the estimated error of the motions in words; empty where it is not known
 
     @classmethod
     def of(cls, times: Floats, actors: Sequence[Actor], speed: float = 1.0, error: str = "") -> Stage:

@@ -57,59 +57,36 @@ _BEADS = 12
 
 @dataclass(frozen=True, eq=False)
 class Item:
-    """An object of a page, or a node for several.
+    """An object of a page, or a node for several."""
 
-    Attributes:
-        node: Its path below the node of its mark.
-        form: The object, if there is one.
-        pose: Transform (4, 4) in the frame of its body.
-        body: The body that carries it, -1 for the base; None for the world.
-        tracks: What moves: three.js's kind and the values (K, ...) at the keyframes, by property.
-    """
-
-    node: str
-    form: Object | None = None
-    pose: Floats = field(default_factory=lambda: np.eye(4))
-    body: int | None = None
+    node: str  # its path below the node of its mark
+    form: Object | None = None  # the object, if there is one
+    pose: Floats = field(default_factory=lambda: np.eye(4))  # transform (4, 4) in the frame of its body
+    body: int | None = None  # the body that carries it, -1 for the base; None for the world
+    # What moves: three.js's kind and the values (K, ...) at the keyframes, by property.
     tracks: Mapping[str, tuple[str, Floats]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
 class Mark:
-    """What is drawn beside a robot.
+    """What is drawn beside a robot."""
 
-    Attributes:
-        kind: A key of ``KINDS``, for the legend, or another word.
-        name: Name in the legend.
-        around: Points around it (P, 3) [m].
-        items: Its objects.
-        tied: The constraint that it shows; its rod moves with the robot.
-    """
-
-    kind: str
+    kind: str  # A key of ``KINDS``, for the legend, or another word
     name: str
-    around: Floats
+    around: Floats  # points around it (P, 3) [m]
     items: Sequence[Item]
-    tied: Constraint | None = None
+    tied: Constraint | None = None  # the constraint that it shows; its rod moves with the robot
 
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """A robot at its keyframes, as its marks need it.
+    """A robot at its keyframes, as its marks need it."""
 
-    Attributes:
-        picture: The robot's shapes.
-        q: Configurations at the keyframes (K, n) [rad or m].
-        size: Size of a robot's motion [m].
-        axes: Unit vectors (3,) to the right and upwards as the camera sees them.
-        swept: Points (P, 3) around the robot's motion [m].
-    """
-
-    picture: Picture
-    q: Floats
-    size: float
-    axes: tuple[Floats, Floats]
-    swept: Floats
+    picture: Picture  # the robot's shapes
+    q: Floats  # configurations at the keyframes (K, n) [rad or m]
+    size: float  # size of a robot's motion [m]
+    axes: tuple[Floats, Floats]  # unit vectors (3,) to the right and upwards as the camera sees them
+    swept: Floats  # points (P, 3) around the robot's motion [m]
 
     @property
     def robot(self) -> Robot:
@@ -180,11 +157,7 @@ def beads(figure: Figure, names: Sequence[str], run: MpcRun, ahead: float, times
 
 
 def references(figure: Figure, given: ArrayLike | Mapping[str, ArrayLike] | None) -> Iterator[Mark]:
-    """Paths in the world, by name.
-
-    Raises:
-        InputError: A path is not (K, 3), is not finite, or stays in one place.
-    """
+    """Paths in the world, by name."""
     if given is None:
         return
     named = given if isinstance(given, Mapping) else {"reference": given}
@@ -210,11 +183,7 @@ def _distinct(points: Floats) -> list[int]:
 
 
 def target_rows(given: Mapping[str, object] | None, end: float) -> dict[str, tuple[Floats, Floats | None]]:
-    """Positions (K, 3) [m] of each target and, for poses, quaternions (K, 4); one row if it is fixed.
-
-    Raises:
-        InputError: A target is none of these, is not finite, or has no rotation; or it moves and the motion does not.
-    """
+    """Positions (K, 3) [m] of each target and, for poses, quaternions (K, 4); one row if it is fixed."""
     if given is not None and not isinstance(given, Mapping):
         raise InputError(f"targets must map names to places or poses, as in {{'cup': [0.5, 0, 0.3]}}, got {given!r}")
     found: dict[str, tuple[Floats, Floats | None]] = {}

@@ -128,21 +128,13 @@ def replay(
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """A robot with its motion and its marks.
-
-    Attributes:
-        robot: The robot.
-        given: Its motion, plan or run.
-        marks: Its marks.
-        t: Times of the motion from 0 (N + 1,) [s].
-        q: Configurations (N + 1, n) [rad or m].
-    """
+    """A robot with its motion and its marks."""
 
     robot: Robot
-    given: Motion
-    marks: Marks
-    t: Floats
-    q: Floats
+    given: Motion  # its motion, plan or run
+    marks: Marks  # its marks
+    t: Floats  # times of the motion from 0 (N + 1,) [s]
+    q: Floats  # configurations (N + 1, n) [rad or m]
 
     @property
     def run(self) -> MpcRun | None:
@@ -294,9 +286,6 @@ def _effort(robot: Robot, given: object, torques: object, shares: Floats) -> Flo
 
     ``torques`` are given (N, n), or True for the motion's controls; ``shares`` (K,) are those of the motion's time. A
     joint without a limit is held against its own largest torque.
-
-    Raises:
-        InputError: The motion does not have torques of all joints, or they are not (N, n).
     """
     values = torques
     if isinstance(torques, bool | np.bool_):

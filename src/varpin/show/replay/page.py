@@ -110,17 +110,11 @@ def _bar(stage: Stage) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Inline:
-    """A page that a notebook shows as the value of a cell.
+    """A page that a notebook shows as the value of a cell."""
 
-    Attributes:
-        html: The page.
-        title: Its title.
-        size: Its largest width, and its height [pixels].
-    """
-
-    html: str
-    title: str
-    size: tuple[int, int]
+    html: str  # the page
+    title: str  # its title
+    size: tuple[int, int]  # its largest width, and its height [pixels]
 
     def __repr__(self) -> str:
         return f"Inline(replay of {self.title}, {len(self.html) / 1e6:.1f} MB)"

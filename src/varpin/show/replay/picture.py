@@ -27,20 +27,13 @@ class Picture:
     """The shapes to draw, by body; body -1 is the base.
 
     The motion of a body's node is one number: the rotation about, or the translation along, the z axis of the joint.
-
-    Attributes:
-        robot: The robot.
-        shapes: Its visual geometry, or a skeleton; on joints of ``robot.free_model``.
-        meshes: Parts of the mesh of each shape; none for a shape of another kind.
-        bodies: Body of each shape, -1 for the base.
-        placements: Placement of each shape in its body's frame.
     """
 
     robot: Robot
-    shapes: Sequence[pin.GeometryObject]
-    meshes: Sequence[tuple[MeshPart, ...]]
-    bodies: Sequence[int]
-    placements: Sequence[pin.SE3]
+    shapes: Sequence[pin.GeometryObject]  # its visual geometry, or a skeleton; on joints of ``robot.free_model``
+    meshes: Sequence[tuple[MeshPart, ...]]  # parts of the mesh of each shape; none for a shape of another kind
+    bodies: Sequence[int]  # body of each shape, -1 for the base
+    placements: Sequence[pin.SE3]  # placement of each shape in its body's frame
 
     @classmethod
     def of(cls, robot: Robot) -> Picture:

@@ -67,11 +67,7 @@ _GIF = {"codec": "gif", "pix_fmt_out": "pal8", "quality": None, "output_params":
 
 
 def frame_size(size: tuple[int, int]) -> tuple[int, int]:
-    """Width and height [pixels], checked.
-
-    Raises:
-        InputError: ``size`` is not two integers >= 16.
-    """
+    """Width and height [pixels], checked."""
     if not isinstance(size, tuple | list) or len(size) != 2:
         raise InputError(f"size must be a width and a height [pixels], got {size!r}")
     width, height = (count("size", number, least=16) for number in size)
@@ -88,12 +84,7 @@ def frame_times(suffix: str, fps: float, duration: float, most: int) -> Floats:
 
 
 def write_film(path: Path, page: Path, times: Floats, size: tuple[int, int]) -> Path:
-    """Write the film of a page, whose frames are at ``times`` (F,) [s].
-
-    Raises:
-        VarpinError: The browser cannot show the page.
-        FileError: The file cannot be written.
-    """
+    """Write the film of a page, whose frames are at ``times`` (F,) [s]."""
     import imageio_ffmpeg  # noqa: PLC0415 - of an extra
 
     suffix = path.suffix.lower()
@@ -114,12 +105,7 @@ def write_film(path: Path, page: Path, times: Floats, size: tuple[int, int]) -> 
 
 
 def check_film(path: Path, size: tuple[int, int] = (16, 16)) -> None:
-    """Check the format and the size of a film, and that the necessary packages and programs are installed.
-
-    Raises:
-        InputError: The format is neither gif nor mp4, or the size is invalid.
-        MissingDependency: A package or a program is not installed.
-    """
+    """Check the format and the size of a film, and that the necessary packages and programs are installed."""
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"video must end in {' or '.join(FORMATS)}, got {path.name!r}")
     width, height = frame_size(size)
@@ -164,11 +150,7 @@ def _browser(size: tuple[int, int]) -> Iterator[Chrome]:
 def film_frames(
     page: Path, times: Floats, size: tuple[int, int], scripts: Sequence[tuple[str, Sequence[float]]] = ()
 ) -> Iterator[NDArray[np.uint8]]:
-    """A page's picture (height, width, 3) at each time [s of playback], after ``scripts`` with their arguments.
-
-    Raises:
-        VarpinError: The browser cannot show the page.
-    """
+    """A page's picture (height, width, 3) at each time [s of playback], after ``scripts`` with their arguments."""
     import imageio.v3 as imageio  # noqa: PLC0415 - of an extra
 
     with _browser(size) as browser:
