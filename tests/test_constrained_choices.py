@@ -85,6 +85,8 @@ def test_work_and_precision_under_constraints():
     }  # fmt: skip
     assert record.reference == "Gauss(stages=4) in ever smaller steps"
     assert record.reference_error < 1e-12
+    # A damped motion keeps no energy.
+    assert all(np.isnan(run.energy_error) for run in record.runs)
     coarse, fine = (run for run in record.runs if run.order == 2)
     assert np.log2(coarse.error / fine.error) == pytest.approx(2.0, abs=0.3)
     with refused(vp.InputError, "RungeKutta4", "constraints"):

@@ -139,7 +139,7 @@ def test_robots_with_joints_of_the_same_names_are_told_apart(tmp_path):
     small = vp.load_robot("ur5")
     path = vp.simulate(vp.Scene(small), np.zeros(6), np.zeros(6), dt=1e-3, steps=3).save(tmp_path / "a.npz")
     assert vp.Trajectory.load(path, small).steps == 3
-    with refused(vp.FileError, "ur5", "'ur10'", "kg"):
+    with refused(vp.FileError, "ur5", "'ur10'", "kg", "payloads", "--robot"):
         vp.Trajectory.load(path, vp.load_robot("ur10"))
 
 

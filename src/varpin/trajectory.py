@@ -388,8 +388,9 @@ class Trajectory(Frozen):
         masses = robot.tree.mass
         if self.masses.shape != masses.shape or not np.allclose(self.masses, masses, rtol=1e-6):
             raise FileError(
-                f"{source} is of robot {self.robot}, whose links weigh {self.masses.sum():.6g} kg in all; "
-                f"{robot.name!r} has joints of the same names, but its links weigh {masses.sum():.6g} kg"
+                f"{source} is of robot {self.robot}, whose links weigh {self.masses.sum():.6g} kg, and those of "
+                f"{robot.name!r} {masses.sum():.6g} kg: load the robot with its payloads, for varpin replay by a scene "
+                "file as --robot"
             )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import null_space
 
 from varpin.arrays import Floats
 from varpin.integrators import Integrator
@@ -19,9 +20,8 @@ from varpin.simulation.choice import usual_integrator
 from varpin.simulation.simulate import simulate
 from varpin.simulation.start import on_constraints
 from varpin.support.checks import JointValues, finite_array, joint_array, positive
+from varpin.support.differences import slopes
 
-# Central differences of eighth order.
-_WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 # Relative errors up to which derivatives are right.
 _RIGHT = 1e-6
 # Rank tolerance of the constraints, relative to their largest singular value.
@@ -56,24 +56,20 @@ class LinearizationCheck:
         """Whether the derivatives are those of the step, to six digits."""
         return self.worst <= _RIGHT
 
-    @property
-    def verdict(self) -> str:
-        """The result in words, with advice."""
-        if self.holds:
-            return f"the derivatives are those of the step, to {self.worst:.0e} of their size"
+    def __str__(self) -> str:
         parts = {"A": self.A, "B": self.B, "G": self.G}
+        rows = [
+            f"{name}  error {error:.1e} of {norm:.3g}" if norm > 0.0 else f"{name}  error {error:.1e}, and none is 0"
+            for name, (error, norm) in parts.items()
+        ]
+        if self.holds:
+            return "\n".join([*rows, f"the derivatives are those of the step, to {self.worst:.0e} of their size"])
         wrong = ", ".join(name for name, part in parts.items() if not _relative(part) <= _RIGHT)
-        return (
+        verdict = (
             f"{wrong} and the differences of the step differ by {self.worst:.1e} of their size: another step= of the "
             "differences, or a smaller dt, shows which of them is wrong"
         )
-
-    def __str__(self) -> str:
-        rows = [
-            f"{name}  error {error:.1e} of {norm:.3g}" if norm > 0.0 else f"{name}  error {error:.1e}, and none is 0"
-            for name, (error, norm) in (("A", self.A), ("B", self.B), ("G", self.G))
-        ]
-        return "\n".join([*rows, self.verdict])
+        return "\n".join([*rows, verdict])
 
 
 def check_linearization(
@@ -121,7 +117,11 @@ def check_linearization(
     if method.variational:
         size = 1.0 / np.diag(np.linalg.inv(lagrangian_jet(scene, q, np.zeros(n)).Lvv))
     rows, zero = np.concatenate([np.ones(n), size]), np.zeros(k)
-    Z = _kept_by_constraints(scene, q) if scene.constraints else np.eye(n)
+    Z = np.eye(n)
+    if scene.constraints:
+        # The velocities that constraints allow, with kinematic inputs at will.
+        C = scene.core.constraints(np.ascontiguousarray(q[None]))[2][0]
+        Z = null_space(np.delete(C, list(scene.inputs), axis=0), rcond=_RANK)
 
     def ends(at: Floats, velocity: Floats, control: Floats, dw: Floats) -> Floats:
         """The state at both ends of the step (4n,)."""
@@ -135,25 +135,22 @@ def check_linearization(
             velocity = along_constraints(scene, at, velocity)
         return ends(at, velocity, u, zero)
 
-    begins, after = np.split(_slope(along, np.zeros(2 * Z.shape[1]), step), 2)
+    begins, after = np.split(slopes(along, np.zeros(2 * Z.shape[1]), step), 2)
     # A position at the end of the step, in a unit that moves the joint at 1 rad/s or m/s.
     of_controls = np.ones(m)
     of_controls[scene.prescribed[: len(scene.inputs)]] = dt
-    by_u = _slope(lambda y: ends(q, v, y, zero), u, step * of_controls)[2 * n :]
-    by_w = _slope(lambda y: ends(q, v, u, y), zero, step)[2 * n :]
+
+    def errors(given: Floats, function: Callable[[Floats], Floats], x: Floats, columns: Floats) -> tuple[float, float]:
+        """The largest error of a derivative at x, and its largest entry."""
+        if not x.size:
+            return 0.0, 0.0
+        return _largest(given, slopes(function, x, step * columns)[2 * n :], columns / rows[:, None])
+
     return LinearizationCheck(
-        A=_largest(lin.A[0] @ begins, after, rows, np.ones(begins.shape[1])),
-        B=_largest(lin.B[0], by_u, rows, of_controls),
-        G=_largest(lin.G[0], by_w, rows, np.ones(k)),
+        A=_largest(lin.A[0] @ begins, after, 1.0 / rows[:, None]),
+        B=errors(lin.B[0], lambda y: ends(q, v, y, zero), u, of_controls),
+        G=errors(lin.G[0], lambda y: ends(q, v, u, y), zero, np.ones(k)),
     )
-
-
-def _kept_by_constraints(scene: Scene, q: Floats) -> Floats:
-    """An orthonormal basis (n, f) of the velocities at q (n,) that constraints allow, with kinematic inputs at will."""
-    C = np.delete(scene.core.constraints(np.ascontiguousarray(q[None]))[2][0], list(scene.inputs), axis=0)
-    _, sizes, basis = np.linalg.svd(C)
-    rank = int((sizes > _RANK * sizes.max(initial=0.0)).sum())
-    return np.ascontiguousarray(basis[rank:].T)
 
 
 def _relative(part: tuple[float, float]) -> float:
@@ -161,22 +158,5 @@ def _relative(part: tuple[float, float]) -> float:
     return error / norm if norm > 0.0 else error
 
 
-def _slope(function: Callable[[Floats], Floats], x: Floats, step: Floats | float) -> Floats:
-    """The derivative of a function by differences; ``step`` is that of each variable, or of all."""
-    if not x.size:
-        return np.zeros((len(function(x)), 0))
-    derivative = []
-    for e in np.diag(np.broadcast_to(step, x.shape)):
-        total = sum(w * (function(x + i * e) - function(x - i * e)) for i, w in _WEIGHTS.items())
-        derivative.append(total / e.max())
-    found: Floats = np.array(derivative, dtype=np.float64).T.reshape(-1, x.size)
-    return found
-
-
-def _largest(given: Floats, derivative: Floats, rows: Floats, columns: Floats) -> tuple[float, float]:
-    """The largest error of a derivative, and its largest entry."""
-    scale = columns[None, :] / rows[:, None]
-    return (
-        float(np.abs((given - derivative) * scale).max(initial=0.0)),
-        float(np.abs(derivative * scale).max(initial=0.0)),
-    )
+def _largest(given: Floats, derivative: Floats, scale: Floats) -> tuple[float, float]:
+    return float(np.abs((given - derivative) * scale).max()), float(np.abs(derivative * scale).max())
