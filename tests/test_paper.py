@@ -1,9 +1,8 @@
-"""The paper's experiments: the store, the claims and the report on made-up cells, and the whole of it, slowly, by the
+"""The paper's experiments: the cells on disk, the claims and the report on made-up cells, and the whole of it, slowly, by the
 command line."""
 
 import csv
 import dataclasses
-import logging
 import re
 import subprocess
 import sys
@@ -17,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 from paper import cases, experiments
 from paper.cases import CASES, COARSE, COARSEST, MAIN, METHODS, VARIATIONS
 from paper.claims import Claim, assess, free_motions
-from paper.experiments import OPTIMUM, PLAIN, STOCHASTIC, Cell, Store, Task, fill, run, tasks
+from paper.experiments import OPTIMUM, PLAIN, STOCHASTIC, Cell, Task, fill, run, tasks
 from paper.figures import draw
 from paper.report import write
 
@@ -79,11 +78,6 @@ def figures(motions):
     return draw({task.name: made_up(task) for task in tasks(quick=True)}, motions)
 
 
-def assert_same(a, b):
-    for item in dataclasses.fields(Cell):
-        np.testing.assert_array_equal(getattr(a, item.name), getattr(b, item.name), err_msg=item.name)
-
-
 def test_tasks_are_complete_and_have_names_of_their_own():
     found = list(tasks(quick=False))
     names = {task.name for task in found}
@@ -141,38 +135,17 @@ def test_nothing_beats_the_optimum_over_held_controls():
     assert np.isnan(own.sampled).all()
 
 
-@pytest.mark.parametrize("task", [Task(MAIN, CASES[2], "Euler", 2e-3), Task(VARIATIONS[0], None, OPTIMUM, COARSE)])
-def test_store_gives_back_what_it_got(tmp_path, task):
-    store, cell = Store(tmp_path / "cells"), made_up(task)
-    assert store.load(task) is None
-    store.save(task, cell)
-    assert_same(Store(tmp_path / "cells").load(task), cell)
-    assert [path.name for path in (tmp_path / "cells").iterdir()] == [f"{task.name}.npz"]
-
-
-def test_a_damaged_cell_is_computed_again(tmp_path, caplog, counted):
-    fill(Store(tmp_path), quick=True)
-    task = next(tasks(quick=True))
-    path = tmp_path / f"{task.name}.npz"
-    path.write_bytes(path.read_bytes()[:100])
-    counted.clear()
-    with caplog.at_level(logging.WARNING, logger="paper"):
-        found = fill(Store(tmp_path), quick=True)
-    assert f"{path} cannot be read" in caplog.text
-    assert counted == [task.name]
-    assert_same(found[task.name], made_up(task))
-
-
 def test_a_second_fill_computes_nothing(tmp_path, counted):
     seen = []
-    first = fill(Store(tmp_path), quick=True, progress=lambda done, cells, name: seen.append((done, cells, name)))
+    first = fill(tmp_path, quick=True, progress=lambda done, cells, name: seen.append((done, cells, name)))
     names = [task.name for task in tasks(quick=True)]
     assert counted == list(first) == names
-    assert seen == [(k, len(names), name) for k, name in enumerate([*names, ""])]
-    second = fill(Store(tmp_path), quick=True)
+    assert seen == [(k, len(names), name) for k, name in enumerate(names)]
+    second = fill(tmp_path, quick=True)
     assert counted == names
     for name in names:
-        assert_same(first[name], second[name])
+        for item in dataclasses.fields(Cell):
+            np.testing.assert_array_equal(getattr(first[name], item.name), getattr(second[name], item.name))
 
 
 def test_claims_hold_where_the_paper_is_right_and_not_where_euler_is_better(cells, motions):

@@ -12,14 +12,14 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from paper.claims import Claim, assess, free_motions
-from paper.experiments import Store, fill
+from paper.experiments import fill
 from paper.figures import draw
 from paper.report import write
 
 
 def reproduce(folder: Path, *, quick: bool = False) -> list[Claim]:
     """Run the experiments, write everything, and return each sentence with its verdict."""
-    cells = fill(Store(folder / "cells"), quick=quick, progress=lambda done, of, name: print(f"{done}/{of} {name}"))
+    cells = fill(folder / "cells", quick=quick, progress=lambda done, of, name: print(f"{done}/{of} {name}"))
     motions = free_motions()
     claims = assess(cells, motions)
     write(folder, cells, claims, draw(cells, motions))

@@ -5,12 +5,11 @@ Equation (O14) of docs/mathematics.md.
 
 from __future__ import annotations
 
-import logging
+import pickle
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 
@@ -19,9 +18,9 @@ from paper.cases import CASES, MAIN, METHODS, VARIATIONS, Case, Setting
 from varpin._version import __version__
 from varpin.arrays import Floats
 from varpin.control import Solution, solve
-from varpin.errors import FileError, VarpinError
+from varpin.errors import VarpinError
 from varpin.integrators import RungeKutta4
-from varpin.io.archive import Axes, members_of, read_npz, record_of, write_npz
+from varpin.io.archive import atomic_file
 from varpin.linearization import linearize
 
 Progress = Callable[[int, int, str], None]
@@ -37,10 +36,6 @@ _PATHS = 400
 _MORE_PATHS = 1000
 # Where gains of different time steps are compared [s].
 GAIN_TIMES = np.linspace(0.02, 1.4, 47)
-
-_FORMAT = "varpin.paper-cell/1"
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -80,10 +75,10 @@ class Cell:
     closed_loop: float
     accuracy: float
     sampled: tuple[float, float] = (np.nan, np.nan)
-    t: Annotated[Floats, Axes("nodes")] = field(default_factory=lambda: np.zeros(0), repr=False)
-    q: Annotated[Floats, Axes("nodes", 3)] = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
-    u: Annotated[Floats, Axes("steps", 3)] = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
-    gains: Annotated[Floats, Axes("times", 3, 6)] = field(default_factory=lambda: np.zeros((0, 3, 6)), repr=False)
+    t: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
+    q: Floats = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
+    u: Floats = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
+    gains: Floats = field(default_factory=lambda: np.zeros((0, 3, 6)), repr=False)
 
     @property
     def true_cost(self) -> float:
@@ -209,53 +204,20 @@ def _middle_gains(solution: Solution) -> Floats:
     return np.array(rows).T.reshape(len(GAIN_TIMES), *gains.shape[1:])
 
 
-class Store:
-    """Cells on disk, one file each."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise FileError(f"cannot make the folder {folder}: {error.strerror}") from None
-
-    def _path(self, task: Task) -> Path:
-        return self.folder / f"{task.name}.npz"
-
-    def load(self, task: Task) -> Cell | None:
-        """The cell, if it is there, whole, and of this version."""
-        path = self._path(task)
-        if not path.is_file():
-            return None
-        try:
-            members = read_npz(path)
-            if str(np.asarray(members.get("version", ""))) != __version__:
-                return None
-            return record_of(Cell, members, path)
-        except (FileError, ValueError) as error:
-            logger.warning("%s cannot be read (%s); it is computed again", path, error)
-            return None
-
-    def save(self, task: Task, cell: Cell) -> None:
-        """Write the cell; a file is there whole or not at all."""
-        write_npz(self._path(task), _FORMAT, {**members_of(cell), "version": __version__})
-
-
-def fill(store: Store, *, quick: bool, progress: Progress | None = None) -> dict[str, Cell]:
-    """All cells, by the names of their tasks; those on disk are not computed again.
+def fill(folder: Path, *, quick: bool, progress: Progress | None = None) -> dict[str, Cell]:
+    """All cells, by the names of their tasks; those of this version in the folder are not computed again.
 
     Ctrl-C loses the cell it interrupts and no other.
     """
+    folder.mkdir(parents=True, exist_ok=True)
     todo = list(tasks(quick=quick))
     cells: dict[str, Cell] = {}
     for number, task in enumerate(todo):
         if progress is not None:
             progress(number, len(todo), task.name)
-        cell = store.load(task)
-        if cell is None:
-            cell = run(task)
-            store.save(task, cell)
-        cells[task.name] = cell
-    if progress is not None:
-        progress(len(todo), len(todo), "")
+        path = folder / f"{task.name}_{__version__}.pickle"
+        if not path.is_file():
+            with atomic_file(path) as stream:
+                stream.write(pickle.dumps(run(task)))
+        cells[task.name] = pickle.loads(path.read_bytes())
     return cells
