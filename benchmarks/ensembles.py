@@ -8,11 +8,11 @@ MuJoCo takes part where it is installed (``pip install "varpin[peers]"``).
     python benchmarks/ensembles.py
 """
 
-import time
 from collections.abc import Callable
 
 import numpy as np
 from peers import mujoco_model
+from timing import in_turns, in_words
 
 import varpin as vp
 
@@ -23,22 +23,16 @@ DT = 1e-3
 START = 0.3  # of every joint [rad]
 
 
-def ensemble(links: int, workers: int) -> Callable[[], float]:
-    """Seconds per path-step of one simulate_ensemble call."""
+def ensemble(links: int, workers: int) -> Callable[[], object]:
+    """One simulate_ensemble call."""
     scene = vp.Scene(vp.planar_chain(links), damping=1e-4, noise=vp.AdditiveNoise(1e-3))
     start = {"q0": np.full(links, START), "v0": np.zeros(links)}
-    size = {"dt": DT, "steps": STEPS, "paths": PATHS}
-
-    def run() -> float:
-        begin = time.perf_counter()
-        vp.simulate_ensemble(scene, **start, **size, rng=0, store=False, quantiles=(), workers=workers)
-        return (time.perf_counter() - begin) / (PATHS * STEPS)
-
-    return run
+    size = {"dt": DT, "steps": STEPS, "paths": PATHS, "workers": workers}
+    return lambda: vp.simulate_ensemble(scene, **start, **size, rng=0, store=False, quantiles=())
 
 
-def rollouts(links: int, threads: int) -> Callable[[], float] | None:
-    """Seconds per path-step of one call of mujoco.rollout on the same chain, or None without MuJoCo."""
+def rollouts(links: int, threads: int) -> Callable[[], object] | None:
+    """One call of mujoco.rollout on the same chain, or None without MuJoCo."""
     model = mujoco_model(vp.Scene(vp.planar_chain(links), damping=1e-4), DT)
     if model is None:
         return None
@@ -51,29 +45,7 @@ def rollouts(links: int, threads: int) -> Callable[[], float] | None:
     first = np.zeros(size)
     mujoco.mj_getState(model, data[0], first, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     starts, states = np.tile(first, (PATHS, 1)), np.zeros((PATHS, STEPS, size))
-
-    def run() -> float:
-        begin = time.perf_counter()
-        rollout.rollout(model, data, starts, nstep=STEPS, state=states, persistent_pool=True)
-        return (time.perf_counter() - begin) / (PATHS * STEPS)
-
-    return run
-
-
-def in_turns(runs: dict[str, Callable[[], float]]) -> dict[str, np.ndarray]:
-    """Of ROUNDS interleaved rounds each, in microseconds."""
-    times: dict[str, list[float]] = {name: [] for name in runs}
-    for run in runs.values():
-        run()
-    for _ in range(ROUNDS):
-        for name, run in runs.items():
-            times[name].append(1e6 * run())
-    return {name: np.array(own) for name, own in times.items()}
-
-
-def in_words(ratios: np.ndarray) -> str:
-    """Median and range."""
-    return f"{np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})"
+    return lambda: rollout.rollout(model, data, starts, nstep=STEPS, state=states, persistent_pool=True)
 
 
 def main() -> None:
@@ -85,7 +57,7 @@ def main() -> None:
                 print("MuJoCo is not installed")
                 break
             runs[name] = run
-        times = in_turns(runs)
+        times = {name: 1e6 / (PATHS * STEPS) * own for name, own in in_turns(runs, ROUNDS).items()}
         print(f"chain of {links}: a path-step {', '.join(f'{name} {own.min():.2f} us' for name, own in times.items())}")
         print(f"  two workers {in_words(times['one'] / times['two'])} times as fast as one")
         if "mujoco two" in times:

@@ -6,9 +6,10 @@ Without guards it takes every root that Newton's method finds and keeps no ledge
 from the same states, on motions that no guard objects to, so that they do the same steps.
 """
 
-import time
+from functools import partial
 
 import numpy as np
+from timing import in_turns
 
 import varpin as vp
 
@@ -31,18 +32,14 @@ def row(name: str) -> str:
     scene = vp.Scene(robot, gravity=(0.0, -9.81, 0.0) if name == "finger" else True)
     start, rest = np.array(q0), np.zeros(robot.dof)
 
-    def run(guard: vp.Guard | None) -> tuple[float, vp.Trajectory]:
-        begin = time.perf_counter()
-        integrator = vp.Midpoint(guard=guard)
-        motion = vp.simulate(scene, start, rest, dt=DT, steps=STEPS, integrator=integrator, check=False)
-        return (time.perf_counter() - begin) / STEPS, motion
-
-    guarded, bare = np.inf, np.inf
-    for _ in range(ROUNDS):
-        seconds, motion = run(vp.Guard())
-        guarded = min(guarded, seconds)
-        seconds, other = run(None)
-        bare = min(bare, seconds)
+    options = {"dt": DT, "steps": STEPS, "check": False}
+    guards = {"guarded": vp.Guard(), "bare": None}
+    runs = {
+        name: partial(vp.simulate, scene, start, rest, integrator=vp.Midpoint(guard=guard), **options)
+        for name, guard in guards.items()
+    }
+    guarded, bare = (own.min() / STEPS for own in in_turns(runs, ROUNDS).values())
+    motion, other = (run() for run in runs.values())
     if not np.array_equal(motion.q, other.q):
         raise SystemExit(f"{name}: the guards objected to a step, so that the two motions differ")
     iterations = motion.statistics.newton_iterations.mean()

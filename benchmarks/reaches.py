@@ -16,7 +16,7 @@ import crocoddyl
 import numpy as np
 import pinocchio as pin
 from crocoddyl_reference import require_gravity
-from sddp import in_turns
+from timing import in_turns
 
 import varpin as vp
 from varpin.control.verification import played
@@ -137,11 +137,11 @@ def whole_solves(name: str, reach: Reach) -> None:
         solver = crocoddyl.SolverFDDP(made)
         solver.th_stop = TOLERANCE * plan.cost
         start = [made.x0] * (N + 1), [hold] * N
-        ours, theirs = in_turns(
-            lambda problem=problem, first=first: vp.solve(problem, first, tolerance=TOLERANCE, check=False),
-            lambda solver=solver, start=start: solver.solve(*start, 100, False),
-            rounds=7,
-        )
+        runs = {
+            "ours": lambda problem=problem, first=first: vp.solve(problem, first, tolerance=TOLERANCE, check=False),
+            "theirs": lambda solver=solver, start=start: solver.solve(*start, 100, False),
+        }
+        ours, theirs = (own.min() for own in in_turns(runs, 7).values())
         a, b = len(plan.history), solver.iter + 1
         print(
             f"  {name:6} N = {N:5d}  varpin Midpoint {1e3 * ours:7.2f} ms, {a:2d} iterations  "
@@ -174,7 +174,7 @@ def same_true_cost(name: str, reach: Reach) -> None:
             cost = played(problem, problem.in_parts(64), commands, vp.RungeKutta4()).cost
             excess = cost / optimum - 1.0
             if abs(excess) <= WITHIN:
-                (seconds,) = in_turns(run, rounds=7)
+                seconds = in_turns({"": run}, 7)[""].min()
                 best[label] = seconds
                 print(f"  {name:6} {label:22} N = {N:5d} {1e3 * seconds:9.2f} ms  {excess:+.2%}")
                 break

@@ -20,6 +20,7 @@ import varpin as vp
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from test_required import hand, two_joint_panda
+from timing import in_turns
 
 ROUNDS, STEPS, DT = 25, 2_000, 1e-3
 LOCK = {f"panda_joint{k}": 0.3 for k in (1, 3, 5, 6, 7)} | {"panda_finger_joint1": 0.02}
@@ -56,12 +57,7 @@ def side_by_side() -> None:
             run = functools.partial(vp.simulate, scene, q0, np.zeros(len(q0)), check=False, **options)
             linearize = functools.partial(vp.linearize, scene, run(), integrator=integrator)
             runs |= {(f"{integrator} step", copies): run, (f"{integrator} linearization", copies): linearize}
-    least = dict.fromkeys(runs, np.inf)
-    for _ in range(ROUNDS):
-        for key, run in runs.items():
-            begin = time.process_time()
-            run()
-            least[key] = min(least[key], time.process_time() - begin)
+    least = {key: times.min() for key, times in in_turns(runs, ROUNDS, time.process_time).items()}
     print("fingers of three joints in one model, against as many times one")
     for what, copies in runs:
         print(f"    {what}, {copies:2} fingers {least[what, copies] / (copies * least[what, 1]):6.3f}")
@@ -69,14 +65,7 @@ def side_by_side() -> None:
 
 def compare(title: str, runs: dict[str, Callable[[], object]]) -> None:
     """Processor times of runs that take turns, the least and the median, and the ratio of the least to the first's."""
-    times: dict[str, list[float]] = {name: [] for name in runs}
-    for run in runs.values():
-        run()
-    for _ in range(ROUNDS):
-        for name, run in runs.items():
-            begin = time.process_time()
-            run()
-            times[name].append(time.process_time() - begin)
+    times = in_turns(runs, ROUNDS, time.process_time)
     first = min(next(iter(times.values())))
     print(title)
     for name, own in times.items():

@@ -7,13 +7,13 @@ Ratios are what counts: machines differ, and this one is noisy. True costs are o
 to the continuous robot. varpin's look at a finished plan is left out, as crocoddyl takes none.
 """
 
-import time
 from collections.abc import Callable
 
 import crocoddyl
 import numpy as np
 import pinocchio as pin
 from crocoddyl_reference import PROBLEMS, Problem, require_gravity, shooting
+from timing import in_turns
 
 import varpin as vp
 from varpin.control.verification import played
@@ -40,19 +40,6 @@ def ours(problem: Problem, N: int, integrator: vp.integrators.Integrator) -> vp.
     return vp.OptimalControlProblem(scene, cost, problem.q0, rest, dt=problem.tf / N, steps=N, integrator=integrator)
 
 
-def in_turns(*runs: Callable[[], object], rounds: int = ROUNDS) -> list[float]:
-    """The fastest of several runs of each [s], taken in turns."""
-    best = [np.inf] * len(runs)
-    for run in runs:
-        run()
-    for _ in range(rounds):
-        for i, run in enumerate(runs):
-            start = time.perf_counter()
-            run()
-            best[i] = min(best[i], time.perf_counter() - start)
-    return best
-
-
 def theirs(
     problem: Problem, model: pin.Model, integrator: str, N: int, solver: type, threshold: float, most: int
 ) -> Callable[[], np.ndarray]:
@@ -77,10 +64,11 @@ def iterations() -> None:
         require_gravity(model)
         for N in sizes:
             own = ours(problem, N, vp.Midpoint())
-            mine, other = in_turns(
-                lambda own=own: vp.solve(own, max_iterations=PASSES - 1, tolerance=1e-300, check=False),
-                theirs(problem, model, "Euler", N, crocoddyl.SolverDDP, 1e-300, PASSES),
-            )
+            runs = {
+                "mine": lambda own=own: vp.solve(own, max_iterations=PASSES - 1, tolerance=1e-300, check=False),
+                "other": theirs(problem, model, "Euler", N, crocoddyl.SolverDDP, 1e-300, PASSES),
+            }
+            mine, other = (own.min() for own in in_turns(runs, ROUNDS).values())
             a, b = (seconds / N / PASSES * 1e6 for seconds in (mine, other))
             print(f"  {name:8s} N = {N:5d}  varpin Midpoint {a:6.2f}  crocoddyl DDP, Euler {b:6.2f}  {a / b:5.2f}")
 
@@ -105,7 +93,7 @@ def time_to_one_percent() -> None:
                     run = lambda ocp=ocp: vp.solve(ocp, tolerance=1e-4, check=False).controls  # noqa: E731
                 else:
                     run = theirs(problem, model, label.split()[-1], N, crocoddyl.SolverFDDP, 1e-4 * optimum, 100)
-                (seconds,) = in_turns(run, rounds=5)
+                seconds = in_turns({"": run}, 5)[""].min()
                 commands = open_loop(run())._replace(hold=64)
                 cost = played(ocp, ocp.in_parts(64), commands, vp.RungeKutta4()).cost
                 excess = cost / optimum - 1.0

@@ -6,12 +6,12 @@ runs, their ratios far less. MuJoCo takes part where it is installed (``pip inst
     python benchmarks/step.py
 """
 
-import time
 from collections.abc import Callable
 
 import numpy as np
 import pinocchio as pin
 from peers import mujoco_model
+from timing import in_turns
 
 import varpin as vp
 
@@ -19,33 +19,26 @@ ROUNDS = 25
 STEPS = 20_000
 
 
-def simulate(scene: vp.Scene, q0: np.ndarray, dt: float) -> Callable[[], float]:
-    """Seconds per step of one simulate call: solver, guards, energy and recording included; no look."""
-
-    def run() -> float:
-        start = time.perf_counter()
-        vp.simulate(scene, q0, np.zeros_like(q0), dt=dt, steps=STEPS, integrator=vp.Midpoint(), check=False)
-        return (time.perf_counter() - start) / STEPS
-
-    return run
+def simulate(scene: vp.Scene, q0: np.ndarray, dt: float) -> Callable[[], object]:
+    """STEPS steps of one simulate call: solver, guards, energy and recording included; no look."""
+    options = {"dt": dt, "steps": STEPS, "integrator": vp.Midpoint(), "check": False}
+    return lambda: vp.simulate(scene, q0, np.zeros_like(q0), **options)
 
 
-def rnea_derivatives(robot: vp.Robot, q0: np.ndarray) -> Callable[[], float]:
-    """Seconds per Python call of pin.computeRNEADerivatives."""
+def rnea_derivatives(robot: vp.Robot, q0: np.ndarray) -> Callable[[], object]:
+    """STEPS Python calls of pin.computeRNEADerivatives."""
     model = robot.model
     data, q, v = model.createData(), robot.configuration(q0), np.zeros(model.nv)
 
-    def run() -> float:
-        start = time.perf_counter()
+    def run() -> None:
         for _ in range(STEPS):
             pin.computeRNEADerivatives(model, data, q, v, v)
-        return (time.perf_counter() - start) / STEPS
 
     return run
 
 
-def mujoco_step(links: int, dt: float) -> Callable[[], float] | None:
-    """Seconds per Python call of mujoco.mj_step on a planar chain, or None without MuJoCo."""
+def mujoco_step(links: int, dt: float) -> Callable[[], object] | None:
+    """STEPS Python calls of mujoco.mj_step on a planar chain, or None without MuJoCo."""
     model = mujoco_model(vp.Scene(vp.planar_chain(links)), dt)
     if model is None:
         return None
@@ -53,23 +46,17 @@ def mujoco_step(links: int, dt: float) -> Callable[[], float] | None:
 
     data = mujoco.MjData(model)
 
-    def run() -> float:
+    def run() -> None:
         mujoco.mj_resetData(model, data)
-        start = time.perf_counter()
         for _ in range(STEPS):
             mujoco.mj_step(model, data)
-        return (time.perf_counter() - start) / STEPS
 
     return run
 
 
-def best(runs: dict[str, Callable[[], float]]) -> dict[str, float]:
-    """The fastest of ROUNDS interleaved rounds of each, in microseconds."""
-    seconds = dict.fromkeys(runs, np.inf)
-    for _ in range(ROUNDS):
-        for name, run in runs.items():
-            seconds[name] = min(seconds[name], run())
-    return {name: 1e6 * value for name, value in seconds.items()}
+def best(runs: dict[str, Callable[[], object]]) -> dict[str, float]:
+    """The fastest of ROUNDS rounds of each, in microseconds a step."""
+    return {name: 1e6 * own.min() / STEPS for name, own in in_turns(runs, ROUNDS).items()}
 
 
 def main() -> None:

@@ -1,5 +1,4 @@
-"""The paper's experiments: the cells on disk, the claims and the report on made-up cells, and the whole of it, slowly, by the
-command line."""
+"""The paper's experiments: cells, claims and the report on made-up cells; all of it, slowly, by the command line."""
 
 import csv
 import dataclasses
