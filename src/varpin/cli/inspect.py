@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import logging
+from typing import Any
 
 from rich.console import Console
 
 from varpin.cli.arguments import (
-    ROBOT_OPTIONS,
     add_gravity,
     add_robot,
     add_vector,
@@ -37,20 +37,15 @@ def add_inspect(parser: argparse.ArgumentParser) -> None:
     add_gravity(parser)
 
 
-def _inspect_scene(request: argparse.Namespace) -> int:
-    file = scene_file(request, request.robot, *ROBOT_OPTIONS, "gravity", "q", "v")
-    rows = [("robot", file.robot.name), *file.required.rows]
-    rows.append(("horizon", f"{file.steps} steps of {file.dt:g} s, {file.integrator}"))
-    show(Table(f"{file.title} ({file.path.name})", (), rows))
-    return 0
-
-
 def _inspect(request: argparse.Namespace, _errors: Console) -> int:
     if names_scene(request.robot):
-        return _inspect_scene(request)
-    arguments = {**robot_options(request), "gravity": request.gravity}
-    report = inspect_robot(request.robot, q=values_of("q", request.q), v=values_of("v", request.v), **arguments)
-    show(report)
+        file = scene_file(request, request.robot)
+        rows = [("robot", file.robot.name), *file.required.rows]
+        rows.append(("horizon", f"{file.steps} steps of {file.dt:g} s, {file.integrator}"))
+        show(Table(f"{file.title} ({file.path.name})", (), rows))
+        return 0
+    values: dict[str, Any] = {name: values_of(name, getattr(request, name)) for name in ("q", "v")}
+    show(inspect_robot(request.robot, **values, gravity=request.gravity, **robot_options(request)))
     return 0
 
 

@@ -6,16 +6,15 @@ import argparse
 import logging
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from rich.console import Console
 
-from varpin.cli.arguments import ROBOT_OPTIONS, add_robot_options, names_scene, robot_options, scene_file
+from varpin.cli.arguments import add_robot_options, names_scene, robot_options, scene_file
 from varpin.cli.console import say, show
 from varpin.cli.outputs import add_replay_options, speed_of, write_all, writers_of
 from varpin.control import solution_trajectory
-from varpin.errors import FileError, InputError, RobotNotFound
+from varpin.errors import InputError, RobotNotFound
 from varpin.io.archive import read_format
 from varpin.io.scenefile import SceneFile
 from varpin.marks import Marks
@@ -41,7 +40,6 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
     )
     add_robot_options(parser)
     outputs = parser.add_argument_group("outputs")
-    outputs.add_argument("--open", action="store_true", help="open a window; the default without an output file")
     add_replay_options(outputs)
     outputs.add_argument("--ghost", type=Path, metavar="NPZ", help="a second motion of the robot, drawn translucent")
     outputs.add_argument("--frames", nargs="+", default=[], metavar="FRAME", help="draw frames as triads")
@@ -49,9 +47,6 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
 
 
 def _replay(request: argparse.Namespace, errors: Console) -> int:
-    asked = request.html is not None or request.video is not None
-    if asked and request.open:
-        raise InputError("--open shows a window, and --html and --video write files: give one or the other")
     first = _motion(request.motion)
     robot, scene = _robot(request, first)
     motion = _motion(request.motion, robot)
@@ -61,14 +56,13 @@ def _replay(request: argparse.Namespace, errors: Console) -> int:
     for name, frames in (("trace", trace), ("frames", request.frames)):
         frame_names(f"--{name}", [robot], frames)
     marks = replace(marks, ghost=ghost, trace=trace, frames=request.frames, torques=request.torques)
-    if not asked:
-        return _window(request, errors, robot, motion, marks)
     writers = writers_of(request, lambda _duration: marks)
-    files = {path: partial(write, robot, motion) for path, write in writers.items()}
+    if not writers:
+        return _window(request, errors, robot, motion, marks)
     with request.interrupts.keeping():
-        written, status = write_all(errors, files, request.interrupts)
-    for path in written:
-        show(f"written: {path}")
+        written, status = write_all(request, errors, writers, robot, motion, motion)
+    for row in written:
+        show("{}: {}".format(*row))
     return status
 
 
@@ -95,22 +89,13 @@ def _motion(path: Path, robot: Robot | None = None) -> Trajectory:
 def _robot(request: argparse.Namespace, motion: Trajectory) -> tuple[Robot, SceneFile | None]:
     """The robot of the motion, and its scene if ``--robot`` names one."""
     if request.robot is not None and names_scene(request.robot):
-        scene = scene_file(request, request.robot, *ROBOT_OPTIONS)
+        scene = scene_file(request, request.robot)
         return scene.robot, scene
     name = request.robot or motion.robot
     try:
-        robot = load_robot(name, **robot_options(request))
+        return load_robot(name, **robot_options(request)), None
     except RobotNotFound as error:
         if request.robot is not None:
             raise
-        raise InputError(
-            f"{request.motion} is of robot {motion.robot!r}, a name that varpin does not know: give its URDF file or "
-            "its scene file as --robot"
-        ) from error
-    missing = [joint for joint in robot.joint_names if joint not in motion.joint_names]
-    if missing and set(motion.joint_names) < set(robot.joint_names):
-        raise FileError(
-            f"{request.motion} has no motion of {', '.join(missing)}: lock them as they were, "
-            f"--lock {' '.join(f'{joint}=VALUE' for joint in missing)}, or give the scene file as --robot"
-        )
-    return robot, None
+        text = f"{request.motion} is of robot {name!r}: give its URDF file or its scene file as --robot"
+        raise InputError(text) from error

@@ -6,14 +6,11 @@ import argparse
 import logging
 import time
 from collections.abc import Callable, Iterable
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
 from varpin.cli.arguments import (
-    ROBOT_OPTIONS,
     add_integrator,
     add_motion,
     add_robot,
@@ -23,8 +20,7 @@ from varpin.cli.arguments import (
     scene_file,
     take_outputs,
 )
-from varpin.cli.console import complain, progress_bar, say, show, written_rows
-from varpin.cli.exits import INTERRUPTED, STEP_FAILED
+from varpin.cli.console import INTERRUPTED, STEP_FAILED, complain, progress_bar, say, show
 from varpin.cli.outputs import Writers, add_outputs, write_all, writers_of
 from varpin.model import Robot
 from varpin.show.given import frame_names
@@ -36,11 +32,6 @@ from varpin.trajectory import Trajectory
 
 # Defaults [s].
 DT, DURATION = 1e-3, 2.0
-# Options that exclude a scene file.
-_OF_MOTIONS = (
-    *(*ROBOT_OPTIONS, "dt", "tolerance", "duration", "steps", "integrator"),
-    *("q0", "v0", "gravity", "damping", "stiffness", "rest", "torque"),
-)
 
 
 def add_simulate(parser: argparse.ArgumentParser) -> None:
@@ -75,7 +66,7 @@ def add_simulate(parser: argparse.ArgumentParser) -> None:
 
 def _simulate(request: argparse.Namespace, errors: Console) -> int:
     if names_scene(request.robot):
-        file = scene_file(request, request.robot, *_OF_MOTIONS)
+        file = scene_file(request, request.robot)
         take_outputs(request, file)
         outputs = writers_of(request, file.marks)
         return _run(request, errors, file.robot, lambda progress: file.simulate(progress=progress), outputs)
@@ -107,7 +98,8 @@ def _run(
 ) -> int:
     """Simulate; write and print the result, or the part before an interruption or failure."""
     frame_names("--trace", [robot], request.trace)
-    status, complaint, begin = 0, "", time.perf_counter()
+    tell: Callable[[Console, str], None] = say
+    status, complaint, begin = 0, "interrupted", time.perf_counter()
     with request.interrupts.keeping():
         try:
             with progress_bar(errors, 1, quiet=request.quiet) as progress:
@@ -116,25 +108,21 @@ def _run(
             trajectory, status = interruption.trajectory, INTERRUPTED
             complaint = f"interrupted after {trajectory.steps} steps, which are kept"
         except StepFailure as failure:
-            trajectory, status = failure.trajectory, STEP_FAILED
+            trajectory, status, tell = failure.trajectory, STEP_FAILED, complain
             complaint = f"{failure.problem}. {failure.advice}. The motion so far is kept"
         wall_time = time.perf_counter() - begin
-        writers = {path: partial(write, robot, trajectory) for path, write in outputs.items()}
-        written, trouble = write_all(errors, writers, request.interrupts)
-    status = status or trouble
+        written, trouble = write_all(request, errors, outputs, robot, trajectory, trajectory)
     if not request.quiet:
         show(_summary(trajectory, wall_time, written))
-    if status == INTERRUPTED:
-        say(errors, complaint or "interrupted")
-    elif complaint:
-        complain(errors, complaint)
-    return status
+    if status or trouble == INTERRUPTED:
+        tell(errors, complaint)
+    return status or trouble
 
 
-def _summary(trajectory: Trajectory, wall_time: float, files: Iterable[Path]) -> Table:
+def _summary(trajectory: Trajectory, wall_time: float, written: Iterable[tuple[str, object]]) -> Table:
     """A table of a run: its settings, work, result and files."""
     steps, statistics, accuracy = trajectory.steps, trajectory.statistics, trajectory.accuracy
-    rows = [
+    rows: list[tuple[str, object]] = [
         ("steps", f"{steps}, {trajectory.dt:g} s each, {trajectory.duration:g} s in all"),
         ("wall time", f"{wall_time:.3g} s"),
     ]
@@ -154,6 +142,6 @@ def _summary(trajectory: Trajectory, wall_time: float, files: Iterable[Path]) ->
         ("v at the end [rad/s or m/s]", "  ".join(f"{x:.6g}" for x in trajectory.v[-1])),
         # The log has the first.
         *(("warning", finding) for finding in trajectory.warnings[1:]),
-        *written_rows(files),
+        *written,
     ]
     return Table(f"{trajectory.robot}: {trajectory.integrator}", (), rows)

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 from rich.console import Console
 
 from varpin.cli.arguments import add_motion, add_robot, motion_of, robot_options
-from varpin.cli.console import progress_bar, say, show
-from varpin.cli.exits import FAULTY, INTERRUPTED, STEP_FAILED
+from varpin.cli.console import FAULTY, INTERRUPTED, STEP_FAILED, progress_bar, say, show
 from varpin.errors import FileError
 from varpin.model import load_robot
 from varpin.study.advice import advise
