@@ -417,9 +417,9 @@ class Trajectory(Frozen):
         return cls.of_members(source, read_npz(source, FORMAT), robot)
 
     @classmethod
-    def of_members(cls, source: Path, members: Mapping[str, Any], robot: Robot | None, prefix: str = "") -> Trajectory:
-        """The trajectory from the entries of the file ``source`` that begin with ``prefix``; errors as :meth:`load`."""
-        found = record_of(cls, members, source, prefix=prefix)
+    def of_members(cls, source: Path, members: Mapping[str, Any], robot: Robot | None) -> Trajectory:
+        """The trajectory from the entries of the file ``source``; errors as :meth:`load`."""
+        found = record_of(cls, members, source)
         _require_scene_values(source, found.scene_values, len(found.joint_names))
         # Energies and momenta overflow before q and v do; they may then be infinite.
         if not np.isfinite(found.p[np.isfinite(found.energy)]).all():
