@@ -102,11 +102,11 @@ def test_joints_that_nothing_touches_are_left_out_of_each_robot(tmp_path):
 
 
 MISTAKES = [
-    (TWO.replace(TWO.split("[[robot]]")[1], "").replace("[[robot]]", "", 1), "robot", "two robots or more"),
-    (TWO.replace('prefix = "right_"', 'prefix = "left_"'), "robot[1].prefix", "'left_dip'"),
+    (TWO.replace(TWO.split("[[robot]]")[1], "").replace("[[robot]]", "", 1), "robot", "two or more robots"),
+    (TWO.replace('prefix = "right_"', 'prefix = "left_"'), "robot", "'left_dip'"),
     (TWO.replace("prefix = ", "prefx = ", 1), "robot[0].prefx", ""),
     (TWO.replace("dip = 0.2 }", "dop = 0.2 }"), "robot[0].lock.dop", "dip"),
-    (TWO.replace('"tip"', '"tipp"'), "robot[0].payload[0].frame", "tip"),
+    (TWO.replace('"tip"', '"tipp"'), "robot[0].payload", "tip"),
     (TWO.replace('"left_mcp", "right_mcp"', '"mcp"'), "actuation.joints[0]", "left_mcp"),
 ]
 

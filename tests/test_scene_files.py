@@ -416,7 +416,7 @@ MISTAKES = [
     ("dip = 0.2", "dop = 0.2", "robot.lock.dop"),
     ("dip = 0.2", "dip = 20", "robot.lock.dip"),
     ("damping = { mcp", "damping = { dip", "damping.dip"),
-    ('"tip"', '"tipp"', "robot.payload[0].frame"),
+    ('"tip"', '"tipp"', "robot.payload"),
     ("mass = 1e-3", "mass = -1e-3", "robot.payload[0].mass"),
     ("[1e-8, 1e-8, 1e-8]", "[1e-8, 1e-8, 9e-8]", "robot.payload[0].inertia"),
     ("gravity = true", "gravity = 9.81", "gravity"),
