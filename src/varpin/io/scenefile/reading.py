@@ -42,15 +42,10 @@ class SceneFileError(VarpinError, ValueError):
 
 @dataclass(frozen=True)
 class Where:
-    """A place in a scene file.
-
-    Attributes:
-        path: The file.
-        key: The key of a value or a table; empty for the top level.
-    """
+    """A place in a scene file."""
 
     path: Path
-    key: str = ""
+    key: str = ""  # of a value or a table; empty for the top level
 
     def at(self, *names: str | int) -> Where:
         """The place of an entry."""

@@ -42,27 +42,16 @@ TABLES = (
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """A term of the cost.
-
-    Attributes:
-        where: Its place.
-        kind: Its type in the file.
-        options: Other keys than these.
-        terminal: Whether it is a cost at the end instead of an integral over time.
-        weight: Weights of its components (c,).
-        target: Their target over time, if there is one.
-        hold: Configuration (n,) that its reference is to hold [rad or m].
-        names: The joints of its components; None for components that are not joints.
-    """
+    """A term of the cost."""
 
     where: Where
-    kind: str
-    options: Mapping[str, Any]
-    terminal: bool
-    weight: Floats
-    target: Timeline | None
-    hold: Floats | None
-    names: tuple[str, ...] | None
+    kind: str  # its type in the file
+    options: Mapping[str, Any]  # other keys than these
+    terminal: bool  # whether it is a cost at the end instead of an integral over time
+    weight: Floats  # of its components (c,)
+    target: Timeline | None  # of its components
+    hold: Floats | None  # configuration (n,) that its reference is to hold [rad or m]
+    names: tuple[str, ...] | None  # the joints of its components; None for components that are not joints
 
     @property
     def frame(self) -> str:
@@ -112,35 +101,20 @@ class _Turning:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A scene file on a robot, complete or without some of its joints.
-
-    Attributes:
-        where: The file.
-        tables: Its content.
-        scene: The scene.
-        q0: Initial configuration (n,) [rad or m].
-        v0: Initial velocity (n,) [rad/s or m/s].
-        dt: Time step [s].
-        steps: N.
-        driven: Names of the driven joints (m).
-        gear: Generalized force per control (m,).
-        torque_limit: Bounds (m,) [N m or N], infinite where there is none.
-        terms: Terms of the cost.
-        controls: Controls of a simulation over time; None for none, ``"hold"`` for those that hold the robot at q0.
-    """
+    """A scene file on a robot, complete or without some of its joints."""
 
     where: Where
-    tables: Mapping[str, Any]
+    tables: Mapping[str, Any]  # the content of the file
     scene: Scene
-    q0: Floats
-    v0: Floats
-    dt: float
+    q0: Floats  # (n,) [rad or m]
+    v0: Floats  # (n,) [rad/s or m/s]
+    dt: float  # [s]
     steps: int
-    driven: tuple[str, ...]
-    gear: Floats
-    torque_limit: Floats
-    terms: tuple[Term, ...] = ()
-    controls: Timeline | str | None = None
+    driven: tuple[str, ...]  # names of the driven joints (m)
+    gear: Floats  # generalized force per control (m,)
+    torque_limit: Floats  # (m,) [N m or N], infinite where there is none
+    terms: tuple[Term, ...] = ()  # of the cost
+    controls: Timeline | str | None = None  # of a simulation; "hold" for those that hold the robot at q0
 
     def require_start(self) -> None:
         """Refuse a start off the constraints."""
@@ -381,18 +355,8 @@ def _on_robot(root: Where, tables: Mapping[str, Any], robot: Robot, dt: float, s
         words = {"stiffness": "springs.stiffness", "Noise": "noise", "control": "actuation", "Servo": "force"}
         key = next((key for word, key in words.items() if word in str(error)), root.of(error, given).key)
         raise SceneFileError(root.path.name, key, str(error)) from None
-    task = Task(
-        root,
-        tables,
-        scene,
-        q0,
-        root.at("initial", "v").numbers(initial.get("v", 0.0), names),
-        dt,
-        steps,
-        driven,
-        gear,
-        limit,
-    )
+    v0 = root.at("initial", "v").numbers(initial.get("v", 0.0), names)
+    task = Task(root, tables, scene, q0, v0, dt, steps, driven, gear, limit)
     horizon = dt, dt * steps
     terms = [_term(where, cost, task, horizon) for where, cost in root.at("cost").tables(tables.get("cost", []))]
     where = root.at("simulate")
