@@ -18,23 +18,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from varpin.arrays import Floats, Mask
-from varpin.control.between_nodes import NOWHERE, BoundBetween, Instants, enforced, followed
+from varpin.control.between_nodes import NOWHERE, Instants, enforced, followed
 from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.line_search import Taken, Trial, line_search
-from varpin.control.margins import widened
 from varpin.control.multipliers import FEASIBLE, Multipliers, flat, split
-from varpin.control.noise import deviations
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.qp import Minimum, Program, changes
 from varpin.control.riccati import Plan, backward, foreseen, noise_shares
 from varpin.control.rollout import around
 from varpin.control.second_order import curvature_along
 from varpin.control.solution import Solution
-from varpin.control.stages import Feedback, Layout, Rows, Stages, Steps, states
+from varpin.control.stages import Layout, Rows, Stages, Steps, states
+from varpin.control.tightening import Tightening
 from varpin.core.arrays import Commands
-from varpin.errors import LinearizationError, StepError, VarpinError
+from varpin.errors import LinearizationError, StepError
 from varpin.integrators import Integrator
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.noise import NoiseFieldError
@@ -50,11 +49,9 @@ logger = logging.getLogger(__name__)
 # Errors that reject a trial, or end a search that has made a step.
 TRIAL_ERRORS = (CostError, NoiseFieldError, CustomForceError, StepError, LinearizationError)
 # The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu: it falls after
-# long steps and rises after a very short one, or after two short ones in a row.
+# long steps and rises after none, or after two short ones in a row.
 _GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e16
-_LONG, _SHORT, _VERY_SHORT = 0.25, 0.1, 0.01
-# Greatest regularization with which a search may end; from 1e-6 to 1e-2.
-_LITTLE = 1e-4
+_LONG, _SHORT = 0.25, 0.1
 # Iterations that together gain no more than the tolerance, or hardly lower violations, before a search ends.
 _PATIENCE = 10
 # Share of the violations that a search has to remove, at its end or in that many iterations; from 1e-3 to 1e-1.
@@ -64,19 +61,10 @@ _NOTHING = 1e-9
 # Weight of the rows in the merit: this many times the largest multiplier, and at most _HEAVY times, as heavy rows
 # shorten steps; where rows cannot all be met, this many times what the cost is per violation. From 3 to 100.
 _ABOVE, _HEAVY = 1.5, 10.0
-# Regularization from which on rows may be missed: it shortens steps only then; from 1e-4 to 1.
-_YIELDING = 1e-2
-# Slack of rows that are met, and of rows that a step approaches, relative to the violations; the latter from 0.5 on.
-_MET, _APPROACHED = 1e-6, 0.9
+# Slack of rows that are met, relative to the violations; from 1e-8 to 1e-4.
+_MET = 1e-6
 # Decrease, as a share of the cost at stake, from which on motions are looked at between nodes; from 1e-4 to 1e-2.
 _CLOSE = 1e-3
-# How often margins are widened by counting motions.
-_COUNTS = 3
-# Iterations in which margins follow the motion, and the share of themselves by which they grow in each: a motion that
-# meets wide margins at once is violent, and has wider ones. From 10 to 50, and 0.05 to 0.2.
-_FOLLOWING, _GROWS = 20, 0.1
-# How often margins follow the motion later, and by which share of the largest they then have to; from 1e-4 to 1e-2.
-_ROUNDS, _MOVES = 30, 1e-3
 # Greatest number of halvings of a trial's steps beyond those that the present motion needs; from 2 to 6.
 _HALVINGS = 4
 # Multipliers that are no more than that, relative to the largest, distances from a limit, relative to it, and falls of
@@ -120,10 +108,7 @@ class Search:
         self.regularization, self.growth = regularization, 1.0
         self.weight = 0.0  # of the rows in the merit, in tenths of their ranges
         self.first = -1.0  # cost at stake on the first motion; -1 before it is known
-        self.added: list[Floats] | None = None  # to margins at the nodes
-        self.counts = 0
-        self.since = 0  # the first iteration from which on rows and margins stay
-        self.rounds = 0  # how often margins have followed the motion of a search that ended
+        self.tightening = Tightening(problem)
         self.history: list[Iteration] = []
         self.cost = np.inf
         self.reason, self.deadline = "", np.inf
@@ -137,7 +122,8 @@ class Search:
         robot = problem.scene.robot.name
         self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {problem.t0:g} s"
         self._enforce(NOWHERE)
-        self.since = self._until()
+        if not tick:
+            self.tightening.renew(0)
 
     def begin(self, commands: Commands) -> None:
         """Begin with the motion under commands.
@@ -159,8 +145,8 @@ class Search:
         state, known = plan.search, plan.multipliers
         assert state is not None
         self._move(plan.trajectory, self.problem.shares(plan.trajectory))
-        self.weight, self.first, self.counts = state.weight, state.first, state.counts
-        self.since, self.rounds = state.since, state.rounds
+        self.weight, self.first, margins = state.weight, state.first, self.tightening
+        margins.counts, margins.since, margins.rounds = state.counts, state.since, state.rounds
         self.regularization, self.growth = state.regularization, state.growth
         self.second_order = self.second_order or state.second_order
         self.history = list(plan.history[: state.iterations])
@@ -170,9 +156,9 @@ class Search:
     def take(self, known: Multipliers) -> None:
         """Take over rows between nodes, multipliers and margins."""
         self._enforce(known.between)
-        self.multipliers, self.backoff = split(self.bound, known.values), split(self.bound, known.backoff)
+        self.multipliers, self.tightening.margins = split(self.bound, known.values), split(self.bound, known.backoff)
         if known.added is not None:
-            self.added = split(self.problem.bound_constraints, known.added)
+            self.tightening.added = split(self.problem.bound_constraints, known.added)
 
     def run(self, tolerance: float, max_iterations: int, deadline: float, report: Report) -> Status:
         """Iterate to the end."""
@@ -265,7 +251,7 @@ class Search:
         self.between, self.whole = between, enforced(self.problem, between)
         self.bound: tuple[BoundConstraint, ...] = self.whole.bound_constraints
         self.multipliers = [np.zeros(item.shape) for item in self.bound]
-        self.backoff = [np.zeros(item.shape) for item in self.bound]  # margins of all rows
+        self.tightening.enforce(self.bound, between)
         self._excess: list[Floats] = [np.zeros(item.size) for item in self.bound]  # in tenths of ranges
 
     def _state(self) -> SearchState:
@@ -274,9 +260,9 @@ class Search:
             regularization=self.regularization,
             growth=self.growth,
             first=self.first,
-            counts=self.counts,
-            since=self.since,
-            rounds=self.rounds,
+            counts=self.tightening.counts,
+            since=self.tightening.since,
+            rounds=self.tightening.rounds,
             second_order=self.second_order,
             iterations=len(self.history),
         )
@@ -304,15 +290,14 @@ class Search:
             self.noise = self._pass(0.0) or plan
         if self._has_goals:
             self.plan = self._pass_to_goals() or plan
-        if len(self.history) < self.since:
-            elastic = self.step is not None and self.step.elastic
-            self._move_margins([move for move, _ in self._margin_moves(self.plan, grow=not elastic)])
+        elastic = self.step is not None and self.step.elastic
+        self.tightening.follow(along, self.plan, len(self.history), grow=not elastic)
         # The step is the pass's own, where that keeps to all limits and rows.
         plain = self.regularization == 0.0 and not self._has_goals
         free = not self.bound and (not problem.limited or self._is_free(plan, ()))
         if not free:
             self.stages = Stages.along(along, self.noise.spread if problem.processes else None, curvature)
-            given = zip(self.bound, self.backoff, strict=True)
+            given = zip(self.bound, self.tightening.margins, strict=True)
             self.rows = [self.stages.rows(*pair) for pair in given]
             self._excess = [_excess(row.values, equality=row.equality) for row in self.rows]
             free = bool(self.bound) and plain and self._is_free(plan, self.rows)
@@ -352,14 +337,14 @@ class Search:
         program = Program(stages, rows, (least, most), plan, self.regularization if rows else 0.0)
         self.program = program
         values, bad = [row.values for row in rows], self._badness
-        found = None if rows and self.regularization > _YIELDING else program.minimum(values)
+        found = program.minimum(values)
         needed = np.inf if found is None else _ABOVE * _largest(found.multipliers)
         # Rows that cost far more than what is at stake are approached step by step.
         dear = max(self.weight, _HEAVY * (max(abs(self.cost), self.first) or program.stiffness))
         elastic = bool(rows) and needed > dear
         if elastic:
             missed = program.minimum(values, weight=dear)
-            elastic = missed is not None and (found is None or missed.slack <= _APPROACHED * bad)
+            elastic = missed is not None
             found, self.weight = (missed, dear) if elastic else (found, self.weight)
         self.unsolved = found is None
         if found is None:
@@ -409,41 +394,11 @@ class Search:
     def _costates(self) -> Floats:
         """Derivatives (N, 2n) of the Lagrangian in the state after each step, with the known multipliers."""
         stages, rows, pushes = Stages.along(self.along), [], []
-        for item, margin, push in zip(self.bound, self.backoff, self.multipliers, strict=True):
+        for item, margin, push in zip(self.bound, self.tightening.margins, self.multipliers, strict=True):
             if push.any() and not item.of_controls:
                 rows.append(stages.rows(item, margin))
                 pushes.append(push.ravel() * item.scale)
         return stages.costates(rows, pushes)
-
-    @property
-    def _has_margins(self) -> bool:
-        return bool(self.problem.processes) and any(item.source.margin > 0.0 for item in self.bound)
-
-    def _until(self) -> int:
-        """The first iteration from which on rows and margins stay, as rows are new: margins follow the motion first."""
-        return len(self.history) + (_FOLLOWING if self._has_margins and not self.tick else 0)
-
-    def _margin_moves(self, plan: Plan, *, grow: bool) -> list[tuple[Floats, Floats]]:
-        """The moves of the margins of all rows towards those of a motion, and these, in the rows' units.
-
-        The latter are standard deviations under the plan's feedback, and what is added. After each round the moves are
-        a smaller part of the way: a motion far from its rows has small margins, which let it come near again.
-        """
-        share, most = 1.0 / (1.0 + self.rounds), _GROWS if grow else 0.0
-        kept = [item for item in self.bound if item.source.margin > 0.0]
-        spreads = iter(deviations(self.along, Feedback(plan.feedback, plan.previous), kept))
-        more = [np.zeros(1)] * len(self.bound)
-        if self.added is not None:
-            more = [*self.added, *(self.added[i][self.between.of(i)[:, 0]] for i in self.between.constraints)]
-        found = []
-        for item, used, extra in zip(self.bound, self.backoff, more, strict=True):
-            own = item.source.margin * next(spreads) if item.source.margin > 0.0 else np.zeros(item.shape)
-            own = np.where(item.in_force if isinstance(item, BoundBetween) else True, own + extra, 0.0)
-            found.append((np.minimum(share * (own - used), most * own), own))
-        return found
-
-    def _move_margins(self, moves: Sequence[Floats]) -> None:
-        self.backoff = [used + move for used, move in zip(self.backoff, moves, strict=True)]
 
     def _ended(self, tolerance: float) -> Status | None:
         """The status of a search whose step gains no more than the tolerance; None if it goes on."""
@@ -452,7 +407,7 @@ class Search:
             # The cost is at its lower bound. Without costs of the controls the model may have no minimum even there.
             return Status.CONVERGED
         found = self._verdict(tolerance)
-        if found is not None and self.regularization > _LITTLE:
+        if found is not None and self.regularization > 0.0:
             # Not if the step without regularization gains more.
             kept = self.regularization, self.growth
             self.regularization = 0.0
@@ -484,7 +439,7 @@ class Search:
 
     def _merits(self) -> list[float]:
         """The merit of the last motions by the present weight, since rows and margins are what they are."""
-        past = self.history[self.since :]
+        past = self.history[self.tightening.since :]
         costs = [item.cost for item in past[:-1]]
         then = [(item.noise_cost, item.violation) for item in past[1:]]
         assert self.noise is not None
@@ -500,57 +455,34 @@ class Search:
                 if not self._made():
                     self.regularization = kept
                     self._made()
-        if problem.processes and problem.limited and not (self._has_margins or self._has_goals or self.tick):
+        if problem.processes and problem.limited and not (self.tightening.needed or self._has_goals or self.tick):
             # Controls at their limits do not react to noise, and the plan tells what it costs then.
             u, (lower, upper) = problem.decided(self.trajectory), problem.control_limits
             held = self._pass(0.0, fixed=(u <= lower) | (u >= upper))
             self.plan, self.noise = held or self.plan, held or self.noise
 
     def _goes_on(self, ended: Status | None) -> bool:
-        """Whether there are further rows between nodes, or wider margins, before a search ends."""
+        """Whether there are further rows between nodes, or other margins, before a search ends."""
         if self.tick:
             return False
-        if ended is not None and self._margins_move(ended):
+        plan, margins, iteration = self.plan, self.tightening, len(self.history)
+        assert plan is not None
+        # What cannot be met is violent, and does not widen margins.
+        grow = ended is not Status.INFEASIBLE
+        if ended is not None and margins.settle(self.along, plan, iteration, grow=grow):
             self.reason = ""
             return True
         if ended is Status.INFEASIBLE:
             return False
         count = len(self.problem.bound_constraints)
-        made = followed(self.problem, self.between, self.trajectory, self.backoff[:count])
+        made = followed(self.problem, self.between, self.trajectory, margins.margins[:count])
         if made is not self.between:
-            kept, margins = self.multipliers[:count], self.backoff[:count]
+            multipliers, used = self.multipliers[:count], margins.margins[:count]
             self._enforce(made)
-            self.multipliers[:count], self.backoff[:count] = kept, margins
-        elif ended is None or not self._counts_motions():
+            self.multipliers[:count], margins.margins[:count] = multipliers, used
+        elif ended is None or not margins.needed or not margins.widen(self.solution(Status.CONVERGED)):
             return False
-        self.since, self.rounds = self._until(), 0
-        return True
-
-    def _counts_motions(self) -> bool:
-        """Whether margins become wider, as motions under noise violate bounds more often than these promise."""
-        if not self._has_margins or self.counts >= _COUNTS:
-            return False
-        self.counts += 1
-        more = None
-        with contextlib.suppress(VarpinError):
-            more = widened(self.solution(Status.CONVERGED))
-        self.added = self.added if more is None else more
-        return more is not None
-
-    def _margins_move(self, ended: Status) -> bool:
-        """Whether the margins of the motion are others than those that it was found with; they then follow it.
-
-        In between they stay: a merit whose rows move with the motion has no minimum.
-        """
-        if self.plan is None or not self._has_margins or self.rounds >= _ROUNDS:
-            return False
-        # What cannot be met is violent, and does not widen margins.
-        moves = self._margin_moves(self.plan, grow=ended is not Status.INFEASIBLE)
-        if all((np.abs(move) <= _MOVES * own.max(axis=0)).all() for move, own in moves):
-            return False
-        if len(self.history) >= self.since:
-            self.since, self.rounds = len(self.history), self.rounds + 1
-        self._move_margins([move for move, _ in moves])
+        margins.renew(iteration)
         return True
 
     def _line_search(self) -> Taken:
@@ -626,7 +558,7 @@ class Search:
         u = self.problem.control_rows(motion)
         return [
             (item.value(motion.q, motion.v, u) + margin).ravel() / item.scale
-            for item, margin in zip(self.bound, self.backoff, strict=True)
+            for item, margin in zip(self.bound, self.tightening.margins, strict=True)
         ]
 
     def _corrected(self, motion: Trajectory) -> Floats | None:
@@ -662,7 +594,7 @@ class Search:
             f"{self.problem.label_of(item.source)} cannot be met from here: {item.rows[row]} at "
             f"t = {item.times[place]:.4g} s stays violated by {left:.3g} {item.unit}"
         )
-        margin = float(self.backoff[k][place, row])
+        margin = float(self.tightening.margins[k][place, row])
         if margin > 0.0:
             self.reason += f", its margin of {margin:.3g} {item.unit} included"
         return Status.INFEASIBLE
@@ -697,7 +629,7 @@ class Search:
             self.regularization *= self.growth
             if self.regularization < _LEAST:
                 self.regularization = 0.0
-        elif lengths[-1] <= _VERY_SHORT or (max(lengths) <= _SHORT and len(lengths) > 1):
+        elif lengths[-1] == 0.0 or (max(lengths) <= _SHORT and len(lengths) > 1):
             return self._stiffen()
         return True
 
@@ -717,9 +649,9 @@ class Search:
         if problem.constraints:
             known = Multipliers(
                 values=flat(self.multipliers),
-                backoff=flat(self.backoff),
+                backoff=flat(self.tightening.margins),
                 between=self.between,
-                added=None if self.added is None else flat(self.added),
+                added=None if self.tightening.added is None else flat(self.tightening.added),
             )
         reason = self.reason
         if plan is not None and plan.loss > _LOSSY:
