@@ -208,7 +208,7 @@ def test_replay_opens_a_window_until_ctrl_c(saved, arm, monkeypatch, capsys):
 
     shown = []
     monkeypatch.setattr("varpin.show.replay.motion.replay", lambda *words, **options: shown.append(options) or Viewer())
-    monkeypatch.setattr("varpin.cli.replay.time.sleep", interrupt)
+    monkeypatch.setattr("varpin.cli.views.time.sleep", interrupt)
     assert main(["replay", saved, "--robot", arm]) == 0
     assert not unnamed(capsys.readouterr().err, "http://here", "Ctrl-C")
     assert shown[0]["open"]
@@ -232,7 +232,7 @@ def test_mistakes_about_replays(words, facts, saved, arm, capsys):
 
 
 def test_outputs_are_checked_before_the_run(arm, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("varpin.cli.simulate.simulate", lambda *_, **__: pytest.fail("the run must not start"))
+    monkeypatch.setattr("varpin.cli.runs.simulate", lambda *_, **__: pytest.fail("the run must not start"))
     kept = str(tmp_path / "kept.npz")
     for option, path in (("--html", "/nowhere/a.html"), ("--plot", "/nowhere/a.png"), ("--save", str(tmp_path))):
         assert main(["simulate", arm, "--save", kept, option, path]) == 2
@@ -269,7 +269,7 @@ def test_failed_step_keeps_what_was_before_it(arm, tmp_path, capsys, monkeypatch
         failure = type("Failure", (), {"reason": "the step is at a fold", "residual": 3.5})
         raise vp.StepFailure(part.steps, part.t[-1], failure, part)
 
-    monkeypatch.setattr("varpin.cli.simulate.simulate", failing)
+    monkeypatch.setattr("varpin.cli.runs.simulate", failing)
     path = tmp_path / "a.npz"
     assert main(["simulate", arm, "--steps", "20", "--save", str(path)]) == 3
     out, err = capsys.readouterr()
@@ -283,7 +283,7 @@ def test_interrupted_run_keeps_its_data(arm, tmp_path, capsys, monkeypatch):
     def interrupt(done, steps):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("varpin.cli.simulate.progress_bar", lambda *_, **__: contextlib.nullcontext(interrupt))
+    monkeypatch.setattr("varpin.cli.runs.progress_bar", lambda *_, **__: contextlib.nullcontext(interrupt))
     path = tmp_path / "a.npz"
     assert main(["simulate", arm, "--dt", "1e-4", "--steps", "40000", "--save", str(path)]) == 130
     out, err = capsys.readouterr()

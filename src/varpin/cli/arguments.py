@@ -21,12 +21,8 @@ from varpin.support.checks import JointValues, joint_array
 
 def add_robot(parser: argparse.ArgumentParser, *, scenes: bool = False) -> None:
     """Add the robot and the options with which it is loaded."""
-    parser.add_argument(
-        "robot",
-        metavar="ROBOT",
-        help="path of a URDF file, or name of a robot of varpin or of example-robot-data"
-        + ("; or a scene file (TOML), or name of a scene of varpin" if scenes else ""),
-    )
+    text = "path of a robot's file, or name of a robot" + ("; or a scene file, or name of a scene" if scenes else "")
+    parser.add_argument("robot", metavar="ROBOT", help=text)
     add_robot_options(parser)
 
 
@@ -39,19 +35,10 @@ _OF_SCENES = (
 
 def add_robot_options(parser: argparse.ArgumentParser) -> None:
     """Add the options with which the robot is loaded; a scene file has more."""
-    parser.add_argument(
-        "--lock",
-        nargs="+",
-        action="extend",
-        metavar="JOINT=VALUE",
-        help="lock joints at positions [rad or m]",
-    )
-    parser.add_argument(
-        "--package-dir",
-        action="append",
-        metavar="DIR",
-        help="folder in which package:// paths of meshes are looked up; repeatable",
-    )
+    text = "lock joints at positions [rad or m]"
+    parser.add_argument("--lock", nargs="+", action="extend", metavar="JOINT=VALUE", help=text)
+    text = "folder in which package:// paths of meshes are looked up; repeatable"
+    parser.add_argument("--package-dir", action="append", metavar="DIR", help=text)
 
 
 def robot_options(request: argparse.Namespace) -> dict[str, Any]:
@@ -104,14 +91,8 @@ def integrator_of_words(text: str) -> Integrator:
 def add_gravity(group: argparse._ActionsContainer) -> None:
     """Add gravity as a vector, or none."""
     gravity = group.add_mutually_exclusive_group()
-    gravity.add_argument(
-        "--gravity",
-        type=float,
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        default=True,
-        help="in world axes [m/s^2]; default: the robot's, 0 0 -9.81",
-    )
+    text = "in world axes [m/s^2]; default: the robot's, 0 0 -9.81"
+    gravity.add_argument("--gravity", type=float, nargs=3, metavar=("X", "Y", "Z"), default=True, help=text)
     gravity.add_argument("--no-gravity", dest="gravity", action="store_false", help="none")
 
 

@@ -9,12 +9,10 @@ from rich.console import Console
 
 from varpin._version import __version__
 from varpin.cli.console import INTERRUPTED, MISTAKE, Parser, complain, logged, say
-from varpin.cli.inspect import add_inspect, add_robots
 from varpin.cli.interrupts import Interrupts
-from varpin.cli.replay import add_replay
-from varpin.cli.simulate import add_simulate
-from varpin.cli.solve import add_solve
+from varpin.cli.runs import add_simulate, add_solve
 from varpin.cli.studies import add_advise, add_extremes, add_tradeoff
+from varpin.cli.views import add_inspect, add_replay, add_robots
 from varpin.errors import VarpinError
 
 _EXAMPLES = """\

@@ -34,16 +34,10 @@ def add_outputs(parser: argparse.ArgumentParser, what: str) -> None:
 def add_replay_options(outputs: argparse._ActionsContainer) -> None:
     """Add options for files that show a motion."""
     outputs.add_argument("--html", type=Path, metavar="HTML", help="write a replay that any browser opens")
-    outputs.add_argument(
-        "--video", type=Path, metavar="MP4", help="write the replay as a video, mp4 or gif; needs varpin[video]"
-    )
+    outputs.add_argument("--video", type=Path, metavar="MP4", help="write a video, mp4 or gif; needs varpin[video]")
     outputs.add_argument("--trace", nargs="+", default=[], metavar="FRAME", help="draw the paths of frames in it")
-    outputs.add_argument(
-        "--speed",
-        type=float,
-        metavar="X",
-        help="speed of the replay; 0.1 is ten times slower; default: the scene file's, or 1",
-    )
+    text = "speed of the replay; 0.1 is ten times slower; default: the scene file's, or 1"
+    outputs.add_argument("--speed", type=float, metavar="X", help=text)
 
 
 # Functions that write a motion of a robot, or the solution that it is of, by the path of the file.

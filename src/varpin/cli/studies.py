@@ -37,9 +37,8 @@ def add_tradeoff(parser: argparse.ArgumentParser) -> None:
     add_robot(parser)
     _add_duration(parser)
     parser.add_argument("--dt", type=float, nargs="+", metavar="S", help="time steps [s]; default: 0.04 and its halves")
-    parser.add_argument(
-        "--repeats", type=int, default=3, metavar="N", help="repetitions of each run; default: %(default)d"
-    )
+    text = "repetitions of each run; default: %(default)d"
+    parser.add_argument("--repeats", type=int, default=3, metavar="N", help=text)
     add_motion(parser)
     _add_outputs(parser)
 
@@ -109,10 +108,8 @@ def _extremes(request: argparse.Namespace, errors: Console) -> int:
     robot = load_robot(request.robot, **robot_options(request))
     folder, patience = _folder(request), 900.0 if request.deep else 20.0
     if not request.quiet:
-        say(
-            errors,
-            f"each motion takes {patience:g} s at most; all together take {'hours' if request.deep else 'minutes'}",
-        )
+        whole = "hours" if request.deep else "minutes"
+        say(errors, f"each motion takes {patience:g} s at most; all together take {whole}")
     record = _kept(request, errors, lambda progress: check_robot(robot, patience=patience, progress=progress))
     if not request.quiet:
         _show_kinds(record)
@@ -125,9 +122,8 @@ def _extremes(request: argparse.Namespace, errors: Console) -> int:
 
 
 def _add_duration(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--duration", type=float, default=1.0, metavar="S", help="of the motion [s]; default: %(default)g"
-    )
+    text = "of the motion [s]; default: %(default)g"
+    parser.add_argument("--duration", type=float, default=1.0, metavar="S", help=text)
 
 
 def _add_outputs(parser: argparse.ArgumentParser, quiet: str | None = "print warnings and errors only") -> None:

@@ -1,11 +1,13 @@
-"""``varpin simulate``: integrate a robot in time."""
+"""``varpin simulate`` and ``varpin solve``: the motion of a robot or a scene file, and the plan of one."""
 
 from __future__ import annotations
 
 import argparse
 import logging
+import shlex
 import time
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console
@@ -22,6 +24,8 @@ from varpin.cli.arguments import (
 )
 from varpin.cli.console import INTERRUPTED, STEP_FAILED, complain, progress_bar, say, show
 from varpin.cli.outputs import Writers, add_outputs, write_all, writers_of
+from varpin.control import Solution, Status
+from varpin.io.scenefile import SceneFile, load_scene
 from varpin.model import Robot
 from varpin.show.given import frame_names
 from varpin.simulation.failures import Interrupted, StepFailure
@@ -37,27 +41,17 @@ DT, DURATION = 1e-3, 2.0
 def add_simulate(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin simulate``."""
     parser.description = (
-        "Integrate a robot, or a scene file, in time with a variational integrator. An option with numbers of joints "
-        "takes one number for all joints, one for each, or JOINT=VALUE for some. Ctrl-C and a failed step keep the "
-        "motion up to there."
+        "Integrate a robot, or a scene file, in time. An option with numbers of joints takes one number for all, "
+        "one for each, or JOINT=VALUE for some. Ctrl-C and a failed step keep the motion up to there."
     )
     parser.set_defaults(run=_simulate, log_level=logging.WARNING)
     add_robot(parser, scenes=True)
     parser.add_argument("--dt", type=float, metavar="S", help=f"time step [s]; default: {DT:g}")
-    parser.add_argument(
-        "--tolerance",
-        type=float,
-        metavar="E",
-        help="largest allowed error in q [rad or m], instead of --dt: selects the cheapest step that meets it, and the "
-        "integrator if none is given",
-    )
+    text = "largest allowed error in q [rad or m] instead of --dt: the cheapest integrator and step that meet it"
+    parser.add_argument("--tolerance", type=float, metavar="E", help=text)
     length = parser.add_mutually_exclusive_group()
-    length.add_argument(
-        "--duration",
-        type=float,
-        metavar="S",
-        help=f"time to simulate [s]; default: {DURATION:g} or near it",
-    )
+    text = f"time to simulate [s]; default: {DURATION:g} or near it"
+    length.add_argument("--duration", type=float, metavar="S", help=text)
     length.add_argument("--steps", type=int, metavar="N", help="the number of steps instead")
     add_integrator(parser)
     add_motion(parser)
@@ -145,3 +139,82 @@ def _summary(trajectory: Trajectory, wall_time: float, written: Iterable[tuple[s
         *written,
     ]
     return Table(f"{trajectory.robot}: {trajectory.integrator}", (), rows)
+
+
+def add_solve(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``varpin solve``."""
+    parser.description = (
+        "Find the motion of least cost of a scene file by S-DDP. Ctrl-C keeps the best motion so far; with --resume a "
+        "saved solution continues as if it had not stopped."
+    )
+    parser.set_defaults(run=_solve, log_level=logging.WARNING)
+    parser.add_argument("scene", metavar="SCENE", help="path of a scene file (TOML), or name of a scene of varpin")
+    parser.add_argument("--resume", type=Path, metavar="NPZ", help="continue from a solution that --save wrote")
+    text = "largest number of iterations; default: the scene's, or 100"
+    parser.add_argument("--max-iterations", type=int, metavar="N", help=text)
+    add_outputs(parser, "solution")
+
+
+def _solve(request: argparse.Namespace, errors: Console) -> int:
+    file = load_scene(request.scene)
+    take_outputs(request, file)
+    outputs = writers_of(request, file.marks)
+    options = {} if request.max_iterations is None else {"max_iterations": request.max_iterations}
+    resume = None if request.resume is None else file.load_solution(request.resume)
+    with request.interrupts.keeping():
+        begin = time.perf_counter()
+        with progress_bar(errors, 1, quiet=request.quiet, unit="iterations at most") as progress:
+            solution = file.solve(resume=resume, progress=progress, **options)
+        wall_time = time.perf_counter() - begin
+        written, trouble = write_all(request, errors, outputs, file.robot, solution.trajectory, solution)
+    converged, refinement = solution.status.converged, solution.refinement
+    unmet = refinement is not None and not refinement.met
+    told = _status(solution, request.scene, request.save)
+    if not request.quiet:
+        # The last two lines are the status, which the next table has, and its reason.
+        show("\n".join(solution.table().splitlines()[:-2]))
+        show(_plan_table(file, solution, told, wall_time, written))
+    if not converged:
+        say(errors, told, style="yellow")
+    if unmet and refinement is not None:
+        say(errors, refinement.reason, style="yellow")
+    if solution.status is Status.INTERRUPTED:
+        return INTERRUPTED
+    return trouble or (0 if converged and not unmet else STEP_FAILED)
+
+
+def _status(solution: Solution, scene: str, saved: Path | None) -> str:
+    """How the search ended, with advice for the command line."""
+    if solution.status is Status.MAX_ITERATIONS:
+        advice = "with --save NPZ this solution can be continued from"
+        if saved is not None:
+            scene, file = (shlex.quote(str(path)) for path in (scene, saved))
+            advice = f"varpin solve {scene} --resume {file} continues from this solution"
+        return f"not converged: more iterations may help; {advice}"
+    return f"infeasible: {solution.reason}" if solution.status is Status.INFEASIBLE else str(solution.status.value)
+
+
+def _plan_table(
+    file: SceneFile, solution: Solution, told: str, wall_time: float, written: Iterable[tuple[str, object]]
+) -> Table:
+    problem, refinement = solution.problem, solution.refinement
+    noise = f", and {solution.noise_cost:.6g} by noise" if solution.noise_cost else ""
+    rows: list[tuple[str, object]] = [
+        ("joints", f"{file.robot.dof} of {file.required.described} computed"),
+        ("horizon", f"{problem.steps} steps of {problem.dt:g} s, {problem.integrator}"),
+        ("status", told),
+        ("cost", f"{solution.cost:.6g}{noise}, after {solution.iterations} iterations"),
+    ]
+    if refinement is not None and refinement.tried:
+        steps = ", ".join(f"{row.dt:g} s" for row in refinement.tried)
+        rows.append(("true cost", f"{refinement.tried[refinement.chosen].true_cost:.6g}, of the steps {steps}"))
+    values = solution.trajectory.scene_values
+    unit = "own units" if file.scene.inputs or values["PositionServo"].size else "N m or N"
+    most = np.abs(solution.trajectory.u).max(axis=0, initial=0.0)
+    rows += [
+        ("wall time", f"{wall_time:.3g} s"),
+        (f"largest controls [{unit}]", "  ".join(f"{value:.4g}" for value in most)),
+        ("q at the end [rad or m]", "  ".join(f"{value:.6g}" for value in solution.trajectory.q[-1])),
+        *written,
+    ]
+    return Table(file.title, (), rows)

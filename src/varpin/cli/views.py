@@ -1,4 +1,4 @@
-"""``varpin replay``: show a saved motion."""
+"""``varpin replay``, ``varpin inspect`` and ``varpin robots``: saved motions and robot descriptions, shown."""
 
 from __future__ import annotations
 
@@ -7,10 +7,20 @@ import logging
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
-from varpin.cli.arguments import add_robot_options, names_scene, robot_options, scene_file
+from varpin.cli.arguments import (
+    add_gravity,
+    add_robot,
+    add_robot_options,
+    add_vector,
+    names_scene,
+    robot_options,
+    scene_file,
+    values_of,
+)
 from varpin.cli.console import say, show
 from varpin.cli.outputs import add_replay_options, speed_of, write_all, writers_of
 from varpin.control import solution_trajectory
@@ -18,26 +28,21 @@ from varpin.errors import InputError, RobotNotFound
 from varpin.io.archive import read_format
 from varpin.io.scenefile import SceneFile
 from varpin.marks import Marks
-from varpin.model import Robot, load_robot
+from varpin.model import Robot, load_robot, robot_names
 from varpin.show.given import frame_names
+from varpin.show.inspection import inspect_robot
 from varpin.support.checks import path_like
+from varpin.support.tables import Table
 from varpin.trajectory import Trajectory
 
 
 def add_replay(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin replay``."""
-    parser.description = (
-        "Show a motion that simulate or solve has saved: in a window of the web browser, until Ctrl-C; or as a page "
-        "or a video."
-    )
+    parser.description = "Show a saved motion in a window of the web browser, until Ctrl-C; or as a page or a video."
     parser.set_defaults(run=_replay, log_level=logging.WARNING)
     parser.add_argument("motion", type=Path, metavar="NPZ", help="a trajectory or a solution, as --save writes it")
-    parser.add_argument(
-        "--robot",
-        metavar="ROBOT",
-        help="path of a URDF file, or name of a robot; or a scene file (TOML), or name of a scene, whose task is shown "
-        "too; default: the robot named in the motion",
-    )
+    text = "a robot, or a scene file, whose task is shown too; default: the robot named in the motion"
+    parser.add_argument("--robot", metavar="ROBOT", help=text)
     add_robot_options(parser)
     outputs = parser.add_argument_group("outputs")
     add_replay_options(outputs)
@@ -99,3 +104,41 @@ def _robot(request: argparse.Namespace, motion: Trajectory) -> tuple[Robot, Scen
             raise
         text = f"{request.motion} is of robot {name!r}: give its URDF file or its scene file as --robot"
         raise InputError(text) from error
+
+
+def add_inspect(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``varpin inspect``."""
+    parser.description = (
+        "Print a robot's joints, links, masses and frames, the largest step that Midpoint accepts, and whatever looks "
+        "wrong. Takes robots that simulate refuses."
+    )
+    # The report repeats the warnings of loading.
+    parser.set_defaults(run=_inspect, log_level=logging.ERROR)
+    add_robot(parser, scenes=True)
+    add_vector(parser, "q", "configuration of the report [rad or m]; default: 0")
+    add_vector(parser, "v", "velocity of the report [rad/s or m/s]; default: 0")
+    add_gravity(parser)
+
+
+def _inspect(request: argparse.Namespace, _errors: Console) -> int:
+    if names_scene(request.robot):
+        file = scene_file(request, request.robot)
+        rows = [("robot", file.robot.name), *file.required.rows]
+        rows.append(("horizon", f"{file.steps} steps of {file.dt:g} s, {file.integrator}"))
+        show(Table(f"{file.title} ({file.path.name})", (), rows))
+        return 0
+    values: dict[str, Any] = {name: values_of(name, getattr(request, name)) for name in ("q", "v")}
+    show(inspect_robot(request.robot, **values, gravity=request.gravity, **robot_options(request)))
+    return 0
+
+
+def add_robots(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``varpin robots``."""
+    parser.description = "List the robots with names: varpin's own, and the fixed-base ones of example-robot-data."
+    parser.set_defaults(run=_robots, log_level=logging.ERROR)
+
+
+def _robots(_request: argparse.Namespace, _errors: Console) -> int:
+    show(Table("Robots", ("name", "joints"), [(name, load_robot(name).dof) for name in robot_names()]))
+    show("joints without mimic joints; --lock locks some of them")
+    return 0
