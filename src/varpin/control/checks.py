@@ -27,7 +27,6 @@ from varpin.control.stages import Feedback, Steps
 from varpin.control.verification import CLEAR, Played, at_start, excess, in_parts, percent, replays
 from varpin.errors import VarpinError
 from varpin.finding import Finding, announce, ranked
-from varpin.linearization import wrong_variances
 from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import closest_controls
 from varpin.model import (
@@ -46,6 +45,7 @@ from varpin.model.kinematics import FrameKinematics, frame_kinematics
 from varpin.simulation.check import check
 from varpin.simulation.record import rollout
 from varpin.simulation.start import in_other_units
+from varpin.simulation.velocity_noise import wrong_spread
 
 logger = logging.getLogger(__name__)
 
@@ -327,7 +327,7 @@ def _noise(solution: Solution) -> Iterator[Finding]:
     n = problem.scene.robot.dof
     of_speeds = {own.source.label for own in margins if own.jacobian(motion.q, motion.v)[:, :, n:].any()}
     if of_speeds:
-        for why in wrong_variances(problem.scene, motion, problem.integrator):
+        for why in wrong_spread(problem.scene, problem.integrator, motion):
             sentence = f"the margin= of {', '.join(sorted(of_speeds))} may be wrong: {why}"
             yield Finding("margins of velocities", sentence)
     yield from too_small(solution)
