@@ -253,7 +253,7 @@ SLOWER = vp.simulate(DAMPED, REST, REST, dt=0.12, steps=12)
         (np.full((13, 2), np.nan), {}, "states"),
         (line([1.0, 0.5]) + np.array([0.0, 0.1]), {}, ("q0", "'joint2'", "0.1")),
         (line([90.0, 45.0]) + 30.0, {}, ("q0", "degrees")),
-        ((np.zeros((13, 2)),), {}, ("(q, v)", "1")),
+        ((np.zeros((13, 2)),), {}, ("states", "(1, 13, 2)")),
         ((np.zeros((13, 2)), np.zeros((12, 2))), {}, ("states", "v", "13")),
         ("path", {}, "states"),
         (OTHER, {}, "joints"),
