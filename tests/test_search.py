@@ -332,5 +332,5 @@ def test_dampers_of_servos_count_where_the_arm_begins():
     M = vp.lagrangian_jet(problem.scene, begin, np.zeros(2)).Lvv
     rate = np.linalg.eigvals(np.linalg.solve(M, np.diag([500.0, 300.0]))).real.max()
     assert rate_at_rest(problem.scene, begin) == pytest.approx(rate, rel=1e-12)
-    assert 0.02 * rate > 10.0
-    assert problem.integrator == vp.Radau(4)
+    for product, chosen in ((11.0, vp.Radau(4)), (9.0, vp.Gauss(4))):
+        assert problem.at(dt=product / rate, steps=2).integrator == chosen
