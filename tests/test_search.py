@@ -225,6 +225,14 @@ def test_the_first_motion_follows_the_path():
         np.testing.assert_allclose(again.trajectory.q, path, atol=4e-3)
 
 
+@pytest.mark.parametrize("controls", ["held", "linear"])
+def test_the_first_motion_of_servos_follows_the_path(controls):
+    """Commands are those whose springs give the torques of inverse dynamics."""
+    problem, path = served(1e3, controls=controls), line(GOAL, 40)
+    found = vp.solve(problem, states=path, max_iterations=0, check=False)
+    np.testing.assert_allclose(found.trajectory.q, path, atol=2e-2)
+
+
 def test_around_an_obstacle():
     """A path above the ball leads to a plan above it; the way below costs more than five times as much."""
     ball = vp.Obstacle.sphere([1.4, 0.0, -1.35], 0.15)

@@ -275,7 +275,7 @@ def _joint_forces(problem: OptimalControlProblem, q: Floats, v: Floats) -> Float
     q, v = q[:: problem.hold], v[:: problem.hold]
     at = 0.5 * (q[:-1] + q[1:])
     rate, acceleration = np.diff(q, axis=0) / period, np.diff(v, axis=0) / period
-    # A servo commanded to its present position exerts no spring force.
+    # What servos add to the command that their springs need to hold their positions.
     still = at @ scene.holding.T @ scene.actuation.T
-    needed: Floats = core.inverse_dynamics(scene.core, at, rate, acceleration) + still
-    return needed - scene.core.forces(at, rate, still)[0]
+    found: Floats = core.inverse_dynamics(scene.core, at, rate, acceleration) - scene.core.forces(at, rate, still)[0]
+    return found
