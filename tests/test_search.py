@@ -156,7 +156,8 @@ def test_noise_never_drives_a_control_out_of_its_limits(noise):
     paths = vp.simulate_ensemble(
         plan.problem.scene, REST, REST, dt=0.06, steps=12, paths=50, rng=0, controls=plan.policy
     )
-    assert paths.integrator == str(plan.problem.integrator)
+    path = vp.simulate(plan.problem.scene, REST, REST, dt=0.06, steps=12, rng=0, controls=plan.policy)
+    assert paths.integrator == path.integrator == str(plan.problem.integrator)
     assert ((paths.u >= lower) & (paths.u <= upper)).all()
     saturated, planned = ((u == lower) | (u == upper) for u in (paths.u, plan.controls))
     assert 0 < planned.sum() < planned.size
