@@ -105,7 +105,7 @@ def frame_index(model: pin.Model, frame: str, robot: str) -> int:
     """Index of a frame by its name: the link's where a joint that may be elsewhere has the same."""
     names = [item.name for item in model.frames]
     if not isinstance(frame, str) or frame not in names:
-        raise UnknownFrame(str(frame), names, robot)
+        raise UnknownFrame(str(frame), names, f"robot {robot!r} has no frame")
     found = [index for index, name in enumerate(names) if name == frame]
     return next((index for index in found if model.frames[index].type == pin.FrameType.BODY), found[0])
 
