@@ -12,8 +12,8 @@
 #include <vector>
 
 #include "arrays.hpp"
-#include "registrations.hpp"
 #include "rollout_arrays.hpp"
+#include "units.hpp"
 
 namespace varpin::border {
 
