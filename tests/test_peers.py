@@ -49,23 +49,6 @@ def test_another_mechanism_does_not_start(peers, case, monkeypatch, change, quan
         peers.require_same(case)
 
 
-def test_whole_motions_of_peers_are_the_exact_one(peers):
-    rest = np.zeros(2)
-    case = peers.Case("chain", vp.Scene(vp.planar_chain(2)), rest, rest, rest, 0.5)
-    exact = vp.simulate(case.scene, rest, rest, dt=1e-2, steps=50, integrator=vp.Reference())
-    motions = {
-        "MuJoCo": (peers.mujoco_motion(case, 1e-2, "RK4"), 1e-4),
-        "Drake, discrete": (peers.drake_motion(case, 1e-2), 0.1),
-        "Drake": (peers.drake_motion(case, 1e-2, "runge_kutta3"), 1e-3),
-        "trep": (peers.trep_motion(case, 1e-2), 1e-2),
-    }
-    for name, (motion, level) in motions.items():
-        if motion is not None:
-            assert motion.said == ""
-            assert np.abs(motion.q - exact.q).max() < level, name
-            assert np.abs(motion.v - exact.v).max() < 10.0 * level, name
-
-
 @pytest.mark.parametrize("kind", ["swing", "rows", "friction"])
 def test_peers_are_driven_alike(peers, case, kind):
     """Torques that swing, that jump, and friction, against varpin's own forces and controls."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -241,10 +242,16 @@ class Trajectory(Frozen):
         return made
 
     def __post_init__(self) -> None:
-        """Arrays that are left out have no columns."""
-        N, m = len(self.t) - 1, self.u.shape[1]
-        shapes = {"constraint_forces": (N, len(self.constraint_labels)), "u_stages": (N, 0, m), "u_nodes": (N + 1, 0)}
+        """Check shapes; arrays that are left out have no columns."""
+        N, n = np.size(self.t) - 1, len(self.joint_names)
+        m, k = (np.shape(array)[1] if np.ndim(array) == 2 else 0 for array in (self.u, self.dw))
+        shapes = {"t": (N + 1,), "energy": (N + 1,)} | dict.fromkeys("qvp", (N + 1, n)) | {"u": (N, m), "dw": (N, k)}
         for name, shape in shapes.items():
+            array = getattr(self, name)
+            if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
+                raise InputError(f"a trajectory's {name} must be a float64 array {shape}, got {reprlib.repr(array)}")
+        left_out = {"constraint_forces": (N, len(self.constraint_labels)), "u_stages": (N, 0, m), "u_nodes": (N + 1, 0)}
+        for name, shape in left_out.items():
             if not getattr(self, name).size:
                 object.__setattr__(self, name, np.zeros(shape))
         _sealed(self.statistics)
@@ -370,10 +377,6 @@ class Trajectory(Frozen):
         expected = found.t[0] + np.arange(found.steps + 1) * found.dt
         if not found.dt > 0.0 or not np.allclose(found.t, expected, rtol=1e-9, atol=1e-9 * found.dt):
             raise FileError(f"{source}: its times t are not dt = {found.dt} s apart")
-        if len(found.joint_names) != found.q.shape[1]:
-            raise FileError(
-                f"{source}: {len(found.joint_names)} joint_names are not those of {found.q.shape[1]} joints"
-            )
         if robot is not None:
             found._require_robot(source, robot)
         return found

@@ -11,7 +11,7 @@ frame's axes (3,) [m]), or, for forces with two ends, a point in world axes (3,)
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
@@ -25,7 +25,7 @@ from varpin.core.arrays import Coupling, Element
 from varpin.errors import InputError
 from varpin.model import Robot
 from varpin.model.tree import place_of_frame
-from varpin.support.checks import JointValues, as_floats, finite_array, joint_array, rotation_matrix, tuple_of, word
+from varpin.support.checks import JointValues, as_floats, finite_array, joint_array, rotation_matrix, word
 from varpin.support.frozen import Frozen
 
 # A frame name or (frame name, point in the frame's axes); a Point may also be a point in world axes.
@@ -122,7 +122,9 @@ class JointForce(Force):
             values = joint_array(name, getattr(self, name), robot.joint_names, uniform=True, absent=none)
             if name in _LIMITS:
                 _refuse(name, values, np.isnan(values) | (values == -none), f"must be a number, or {none} for none")
-            numbers[name] = values if name in _SIGNED + _POSITIVE else not_negative(name, values)
+            if name not in _SIGNED + _POSITIVE:
+                _refuse(name, values, values < 0.0, "must be >= 0")
+            numbers[name] = values
         acts = self.acts(numbers, robot)
         for name in numbers.keys() & set(_POSITIVE):
             _refuse(name, numbers[name], acts & ~(numbers[name] > 0.0), "must be > 0")
@@ -484,22 +486,7 @@ def keeps_energy(coupling: Coupling) -> bool:
     return not COUPLINGS[coupling.kind].force
 
 
-def forces_of(given: Force | Sequence[Force]) -> tuple[Force, ...]:
-    """A force or a sequence of them as a tuple.
-
-    Raises:
-        InputError: Something else is given.
-    """
-    return tuple_of("forces", given, Force)
-
-
-def not_negative(name: str, values: Floats) -> Floats:
-    """``values`` for each joint (n,) if none is negative; an InputError otherwise."""
-    return _refuse(name, values, values < 0.0, "must be >= 0")
-
-
-def _refuse(name: str, values: Floats, wrong: Mask, what: str) -> Floats:
+def _refuse(name: str, values: Floats, wrong: Mask, what: str) -> None:
     if wrong.any():
         c = int(np.argmax(wrong))
         raise InputError(f"{name}[{c}] is {values[c]}; it {what}")
-    return values

@@ -25,27 +25,25 @@ from varpin.mechanics.constraints import (
     Constraint,
     CustomConstraint,
     KinematicInput,
-    constraints_of,
     joined,
 )
 from varpin.mechanics.custom import CustomForce, CustomForces
 from varpin.mechanics.description import description_constraints
 from varpin.mechanics.forces import (
+    ELEMENTS,
     CoulombFriction,
     Force,
     JointDamper,
     JointSpring,
     JointStop,
     dissipates,
-    forces_of,
     keeps_energy,
-    not_negative,
     of_kind,
 )
 from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, bind, models_of
 from varpin.model import Robot, degrees_hint, require_robot
 from varpin.model.tree import block_ends, mechanism, path_coordinates
-from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array
+from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array, tuple_of
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
 from varpin.support.weak import Weak
@@ -523,7 +521,7 @@ class Scene(Frozen):
             rows.append(("constraints.between", [product.factor, product.constant, *places]))
         rows += [("constraints.ties", (t.follower, t.leader, t.rate, *t.coefficients)) for t in constraints.ties]
         rows += [("constraints.custom", [own.rows]) for own in constraints.customs]
-        values |= _tables(rows)
+        values |= {kind: np.zeros((0, 0)) for kind in ELEMENTS if kind not in _SUMMED} | _tables(rows)
         if self.noise.diffusion is not None:
             fields = self.noise.diffusion
             values |= {"noise.constant": fields.constant, "noise.control": np.linalg.norm(fields.control, axis=2)}
@@ -731,7 +729,8 @@ def given_constraints(
     if asked := isinstance(parts, list | tuple) and any(is_one_of(part, ("robot",)) for part in parts):
         own = description_constraints(robot)
         parts = [each for part in parts for each in (own if is_one_of(part, ("robot",)) else (part,))]
-    found = constraints_of(parts)
+    note = "; those of a plan, such as limits and obstacles, belong to varpin.OptimalControlProblem(constraints=)"
+    found = tuple_of("constraints", parts, Constraint, note)
     # Kinematic inputs alone are no decision on those of the description.
     decided = given is not None and not (found and all(isinstance(part, KinematicInput) for part in found))
     gives = bool(robot.equalities)
@@ -748,7 +747,7 @@ def _forces(
     rest: JointValues,
 ) -> dict[str, Any]:
     """The attributes of a scene that follow from its forces, by name."""
-    given = forces_of(forces)
+    given: tuple[Force, ...] = tuple_of("forces", forces, Force)
     kinds = {type(force) for force in given}
 
     def resistance(name: str, value: Any, own: Floats, *, decided: bool) -> Floats:
@@ -757,13 +756,13 @@ def _forces(
             raise InputError(f"{name} must be numbers, or 'robot' for those of the robot's description, got {value!r}")
         _warn_of_description(robot, name, name, gives=bool(own.any()), asked=asked, decided=decided)
         values = own if asked else 0.0 if value is None else value
-        return not_negative(name, joint_array(name, values, robot.joint_names, uniform=True))
+        return joint_array(name, values, robot.joint_names, uniform=True)
 
     viscous = resistance("damping", damping, robot.damping, decided=damping is not None or JointDamper in kinds)
     # Numbers for the damping are a decision on the dry friction, too.
     decided = friction is not None or not (damping is None or is_one_of(damping, ("robot",)))
     dry = resistance("friction", friction, robot.friction, decided=decided or CoulombFriction in kinds)
-    stiff = not_negative("stiffness", joint_array("stiffness", stiffness, robot.joint_names, uniform=True))
+    stiff = joint_array("stiffness", stiffness, robot.joint_names, uniform=True)
     slack = joint_array("rest", rest, robot.joint_names, uniform=True)
     positions = {"rest": slack if stiff.any() else np.zeros(robot.dof)}
     given = (
