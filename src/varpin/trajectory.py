@@ -396,46 +396,6 @@ class Trajectory(Frozen):
             )
 
 
-def chained(parts: Sequence[Trajectory]) -> Trajectory:
-    """Concatenate motions with the same dt, each of which begins at the end of the previous one.
-
-    Their warnings are left out, as the times in them are those of the parts.
-
-    Raises:
-        InputError: Their controls change within steps, at different numbers of stages.
-    """
-    first = parts[0]
-    steps = sum(part.steps for part in parts)
-    arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(first, name)[:1], *(getattr(part, name)[1:] for part in parts)])
-        for name in ("q", "v", "p", "energy")
-    }
-    # The controls of two motions may differ at the node where they meet.
-    arrays["u_nodes"] = np.zeros((steps + 1, 0))
-    of_steps = ("u", "dw", "constraint_forces")
-    arrays |= {name: np.concatenate([getattr(part, name) for part in parts]) for name in of_steps}
-    stages = sorted({part.u_stages.shape[1] for part in parts} - {0})
-    if len(stages) > 1:
-        raise InputError(
-            f"motions whose controls change within steps are chained only if they have the same number of stages, got "
-            f"{' and '.join(map(str, stages))}"
-        )
-    # A control that is constant over a step has the same value at all stages.
-    within = [part.u_stages if part.u_stages.shape[1] or not stages else part.u[:, None].repeat(stages[0], axis=1)
-           for part in parts]  # fmt: skip
-    arrays["u_stages"] = np.concatenate(within)
-    return replace(
-        first,
-        t=first.t[0] + np.arange(steps + 1) * first.dt,
-        **arrays,
-        statistics=joined([part.statistics for part in parts]),
-        warnings=(),
-        accuracy=None,
-        error=None,
-        error_bound=None,
-    )
-
-
 def require_trajectory(motion: object) -> Trajectory:
     """``motion`` itself; an InputError if it is no Trajectory, which names that of a plan or a controller's run."""
     if isinstance(motion, Trajectory):

@@ -125,9 +125,20 @@ class Variational(Compiled):
     def holds_noise(self) -> bool:
         return self.kick == "held"
 
+    def damped(self, z: Floats) -> tuple[Floats, Floats]:
+        """See :meth:`Integrator.damped`."""
+        a, b, c = self._coefficients()
+        stages = np.linalg.solve(np.eye(len(c)) + z[:, None, None] * a, np.stack([np.ones_like(c), c], axis=1))
+        kept, held = (1.0 - z[:, None] * (b @ stages)).T
+        return kept, held if self.holds_noise else self.left * kept + (1.0 - self.left)
+
     @property
     def keeps_constraints(self) -> bool:
         return self._constraint_places() is not None
+
+    @abstractmethod
+    def _coefficients(self) -> tuple[Floats, Floats, Floats]:
+        """A (s, s), b (s,) and c (s,) over a unit step, by which forces act."""
 
     @abstractmethod
     def _tableau(self) -> Tableau:

@@ -2,7 +2,7 @@
 
 An entry of a file is a field of the record, under its name: ``dt``. The entry of a field of a nested record is
 ``statistics.jets``. The annotations of the fields define type and shape of the entries; a field with a default may be
-missing. Every file has a ``format``: a name and a version.
+missing, and one whose metadata have ``entry=None`` is left out. Every file has a ``format``: a name and a version.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import typing
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
+from enum import Enum
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, BinaryIO, TypeVar
@@ -130,30 +131,38 @@ def members_of(record: Any, prefix: str = "") -> dict[str, Any]:
     members: dict[str, Any] = {}
     kind: Any = type(record)
     hints = _hints(kind)
-    for item in fields(record):
+    for item in _stored(kind):
         name, value, hint = prefix + _entry(item), getattr(record, item.name), _required(hints[item.name])
         if value is None:
             continue
         if is_dataclass(value):
             members |= members_of(value, f"{name}.")
         elif (row := _row(hint)) is not None:
-            members |= {f"{name}.{own.name}": np.array([getattr(each, own.name) for each in value]) for own in row}
+            for own in row:
+                members[f"{name}.{own.name}"] = np.array([_plain(getattr(each, own.name)) for each in value])
         elif isinstance(value, Mapping):
             members |= {f"{name}.{key}": array for key, array in value.items()}
         else:
-            members[name] = np.array([_text(own) for own in value], dtype=np.str_) if _texts(hint) else value
+            members[name] = np.array([_plain(own) for own in value], dtype=np.str_) if _texts(hint) else _plain(value)
     return members
 
 
 def record_of(
-    kind: type[T], members: Members, source: Path, *, prefix: str = "", sizes: Mapping[str, int] | None = None
+    kind: type[T],
+    members: Members,
+    source: Path,
+    *,
+    prefix: str = "",
+    sizes: Mapping[str, int] | None = None,
+    known: Mapping[str, Any] | None = None,
 ) -> T:
-    """A record built from the entries of an npz file whose names begin with ``prefix``; ``sizes`` are known axes.
+    """A record built from the entries of an npz file whose names begin with ``prefix``.
 
-    Raises a FileError that names the file, the entry, and what is expected.
+    ``sizes`` are known axes, ``known`` the values of fields without an entry. Raises a FileError that names the file,
+    the entry, and what is expected.
     """
     builder = _Builder(source, dict(sizes or {}))
-    record: T = builder.build(kind, builder.tables(kind, members, prefix), prefix.removesuffix("."))
+    record: T = builder.record(kind, builder.tables(kind, members, prefix), prefix.removesuffix("."), known)
     return record
 
 
@@ -168,7 +177,7 @@ class _Builder:
         """The entries of an npz file by field: records are tables."""
         tables: dict[str, Any] = {}
         hints = _hints(kind)
-        for item in fields(kind):
+        for item in _stored(kind):
             key, hint = _entry(item), _required(hints[item.name])
             name = prefix + key
             below = {
@@ -200,7 +209,7 @@ class _Builder:
                 raise self.error(entry, f"{value.dtype} {value.shape}", "a single value or a list")
             value = np.asarray(value).tolist()
         if is_dataclass(hint):
-            return self._record(hint, value, entry)
+            return self.record(hint, value, entry)
         if typing.get_origin(hint) is tuple:
             return self._tuple(hint, value, entry)
         if typing.get_origin(hint) is Mapping:
@@ -223,11 +232,11 @@ class _Builder:
         whole.setflags(write=False)
         return whole
 
-    def _record(self, kind: Any, value: Any, entry: str) -> Any:
+    def record(self, kind: Any, value: Any, entry: str, known: Mapping[str, Any] | None = None) -> Any:
         if not isinstance(value, dict):
             raise self.error(entry, reprlib.repr(value), "a table")
-        hints, given = _hints(kind), {}
-        for item in fields(kind):
+        hints, given = _hints(kind), dict(known or {})
+        for item in _stored(kind):
             key = _entry(item)
             name = f"{entry}.{key}" if entry else key
             if key in value:
@@ -256,6 +265,10 @@ class _Builder:
     def _scalar(self, kind: Any, value: Any, entry: str) -> Any:
         if issubclass(kind, Finding):
             return kind.of_entry(self._scalar(str, value, entry))
+        if issubclass(kind, Enum):
+            if value not in kind.__members__:
+                raise self.error(entry, reprlib.repr(value), f"a {kind.__name__}")
+            return kind[value]
         if kind is float and type(value) is int and abs(value) < 2**53:
             return float(value)
         if type(value) is not kind:
@@ -271,6 +284,11 @@ def _hints(kind: Any) -> dict[str, Any]:
 def _entry(item: Any) -> str:
     """The name of a field in files: ``entry`` of its metadata, or else the name of the field."""
     return str(item.metadata.get("entry", item.name))
+
+
+def _stored(kind: Any) -> list[Any]:
+    """The fields of a record that have entries in files."""
+    return [item for item in fields(kind) if item.metadata.get("entry", "") is not None]
 
 
 def _required(hint: Any) -> Any:
@@ -292,9 +310,11 @@ def _row(hint: Any) -> Sequence[Any] | None:
     return fields(kinds[0]) if is_dataclass(kinds[0]) else None
 
 
-def _text(value: str) -> str:
-    """A text, or a finding with its numbers, as one string."""
-    return value.entry() if isinstance(value, Finding) else value
+def _plain(value: Any) -> Any:
+    """A value as files have it: a finding with its numbers as one text, and a member of an enumeration by its name."""
+    if isinstance(value, Finding):
+        return value.entry()
+    return value.name if isinstance(value, Enum) else value
 
 
 def _array_type(hint: Any) -> tuple[np.dtype[Any], Axes | None]:
