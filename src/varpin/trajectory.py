@@ -245,7 +245,8 @@ class Trajectory(Frozen):
         """Check shapes; arrays that are left out have no columns."""
         N, n = np.size(self.t) - 1, len(self.joint_names)
         m, k = (np.shape(array)[1] if np.ndim(array) == 2 else 0 for array in (self.u, self.dw))
-        shapes = {"t": (N + 1,), "energy": (N + 1,)} | dict.fromkeys("qvp", (N + 1, n)) | {"u": (N, m), "dw": (N, k)}
+        shapes: dict[str, Any] = {"t": (N + 1,), "energy": (N + 1,), "u": (N, m), "dw": (N, k)}
+        shapes |= dict.fromkeys("qvp", (N + 1, n))
         for name, shape in shapes.items():
             array = getattr(self, name)
             if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:

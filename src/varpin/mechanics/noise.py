@@ -337,7 +337,7 @@ def bind(models: Sequence[Noise], actuation: Floats, joints: Sequence[str]) -> B
         UnknownJoint: A model names a joint that is not in ``joints``.
         InputError: Parameters do not fit the robot.
     """
-    parts = [_noise(*actuation.shape, 0), *(model.bind(actuation, joints) for model in models)]
+    parts = [_noise(len(actuation), actuation.shape[1], 0), *(model.bind(actuation, joints) for model in models)]
     firsts = np.cumsum([0, *(part.processes for part in parts)]).tolist()
     own = [(first + k, noise) for first, part in zip(firsts, parts, strict=False) for k, noise in part.own]
     columns = zip(*(part.arrays for part in parts), strict=True)
