@@ -318,21 +318,14 @@ class Trajectory(Frozen):
         )
 
     def _repr_html_(self) -> str:
-        statistics = self.statistics
         rows: list[tuple[str, object]] = [
             ("steps", f"{self.steps} of {self.dt:g} s, {self.duration:g} s in all"),
             ("integrator", self.integrator),
             ("energy [J]", f"{self.energy[0]:.6g} at first, {self.energy[-1]:.6g} in the end"),
             ("energy's largest change [J]", f"{np.abs(self.energy - self.energy[0]).max():.3g}"),
         ]
-        if statistics.energy_defect.any():
-            rows.append(("of it, not the work of a force [J]", f"{np.abs(statistics.energy_defect).max():.3g}"))
         if self.error_text:
             rows.append(("estimated error of q [rad or m]", self.error_text.removeprefix("error ")))
-        if statistics.newton_iterations.any():
-            rows.append(("Newton iterations", f"{statistics.newton_iterations.mean():.2f} a step"))
-        if statistics.split_steps:
-            rows.append(("split by the guards", f"{statistics.split_steps} steps"))
         rows += [("warning", warning) for warning in self.warnings]
         ends = zip(self.joint_names, self.q[0], self.q[-1], self.q.min(axis=0), self.q.max(axis=0), strict=True)
         speeds = np.abs(self.v).max(axis=0)

@@ -10,6 +10,7 @@ frame's axes (3,) [m]), or, for forces with two ends, a point in world axes (3,)
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
@@ -23,10 +24,12 @@ from varpin.arrays import Floats, Mask
 from varpin.core import coupling_kinds, element_kinds
 from varpin.core.arrays import Coupling, Element
 from varpin.errors import InputError
-from varpin.model import Robot
+from varpin.model import Robot, degrees_hint
 from varpin.model.tree import place_of_frame
 from varpin.support.checks import JointValues, as_floats, finite_array, joint_array, rotation_matrix, word
 from varpin.support.frozen import Frozen
+
+logger = logging.getLogger(__name__)
 
 # A frame name or (frame name, point in the frame's axes); a Point may also be a point in world axes.
 FramePoint: TypeAlias = str | tuple[str, ArrayLike]
@@ -128,6 +131,10 @@ class JointForce(Force):
         acts = self.acts(numbers, robot)
         for name in numbers.keys() & set(_POSITIVE):
             _refuse(name, numbers[name], acts & ~(numbers[name] > 0.0), "must be > 0")
+        for name in (name for name in _SIGNED if name in numbers):
+            places = np.where(acts & np.isfinite(numbers[name]), numbers[name], 0.0)
+            if units := degrees_hint(robot, f"{name} of the {type(self).__name__}", places):
+                logger.warning(units)
         table = np.column_stack([numbers[name] for name in self.columns or numbers])
         return tuple(Element(type(self).__name__, int(c), tuple(table[c].tolist())) for c in np.flatnonzero(acts))
 

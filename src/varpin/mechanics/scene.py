@@ -9,6 +9,7 @@ import logging
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import count
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats, Integers
 from varpin.core import Mechanism
-from varpin.core.arrays import ConstraintRows, Coupling, Diffusion, Element, Tied
+from varpin.core.arrays import Coupling, Diffusion, Element, Tied
 from varpin.errors import InputError
 from varpin.finding import Told
 from varpin.mechanics.constraints import (
@@ -41,7 +42,7 @@ from varpin.mechanics.forces import (
     of_kind,
 )
 from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, bind, models_of
-from varpin.model import Robot, degrees_hint, require_robot
+from varpin.model import Robot, require_robot
 from varpin.model.tree import block_ends, mechanism, path_coordinates
 from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array, tuple_of
 from varpin.support.frozen import Frozen
@@ -164,10 +165,15 @@ class Scene(Frozen):
         values["constraints"] = given_constraints(robot, constraints)
         bound, order = joined([constraint.bind(robot) for constraint in values["constraints"]])
         inputs = [tie.follower for tie in filter(_is_input, bound.rows.ties)]
-        driven = _driven(robot, _actuation(robot, actuation), of_kind(values["elements"], "PositionServo"), inputs)
+        servos = of_kind(values["elements"], "PositionServo")
+        driven = _driven(robot, _actuation(robot, actuation), servos, inputs)
         values["actuation"], bound = _with_rates(driven, bound)
         models = models_of(noise)
-        _refuse_noisy_servos(models, values["elements"], robot)
+        if servos and any(isinstance(model, ControlNoise) for model in models):
+            raise InputError(
+                "ControlNoise is proportional to forces, but the control of joint "
+                f"{robot.joint_names[servos[0].coordinate]!r} is the position of its servo: take AdditiveNoise"
+            )
         # Kinematic inputs absorb all forces on their joints.
         forced = values["actuation"].copy()
         forced[inputs] = 0.0
@@ -436,7 +442,7 @@ class Scene(Frozen):
     @cached_property
     def core(self) -> Mechanism:
         """The scene in the compiled core, without noise fields that only Python can evaluate."""
-        fields = self.diffusion
+        fields, rows = self.diffusion, self.bound_constraints.rows
         return mechanism(
             self.robot.tree,
             periodic=self._periodic(),
@@ -447,7 +453,12 @@ class Scene(Frozen):
             gravity=self.gravity,
             forces=self.elements,
             couplings=self.couplings,
-            constraints=_unowned(self.bound_constraints.rows),
+            # The scene owns the functions of users.
+            constraints=rows._replace(
+                customs=tuple(
+                    row._replace(value=Weak(row.value), curvature=Weak(row.curvature)) for row in rows.customs
+                )
+            ),
             custom=None if self.custom is None else Weak(self.custom),
             actuation=self.actuation,
             constant=fields.constant,
@@ -601,13 +612,6 @@ def joints_with(values: ArrayLike, names: Sequence[str]) -> str:
     return "on every joint" if acting and len(acting) == len(names) else f"on {', '.join(acting)}" if acting else "none"
 
 
-def _unowned(rows: ConstraintRows) -> ConstraintRows:
-    """Rows with weak references to their functions, which the scene owns."""
-    return rows._replace(
-        customs=tuple(row._replace(value=Weak(row.value), curvature=Weak(row.curvature)) for row in rows.customs)
-    )
-
-
 def _tables(rows: Sequence[tuple[str, Sequence[float]]]) -> dict[str, Floats]:
     """Rows of numbers by name as one array for each name; zeros fill short rows."""
     tables = {}
@@ -758,29 +762,18 @@ def _forces(
     # Numbers for the damping are a decision on the dry friction, too.
     decided = friction is not None or not (damping is None or is_one_of(damping, ("robot",)))
     dry = resistance("friction", friction, robot.friction, decided=decided or CoulombFriction in kinds)
-    stiff = joint_array("stiffness", stiffness, robot.joint_names, uniform=True)
-    slack = joint_array("rest", rest, robot.joint_names, uniform=True)
-    positions = {"rest": slack if stiff.any() else np.zeros(robot.dof)}
-    given = (
-        *([JointSpring(stiff, slack)] if stiff.any() else []),
-        *([JointDamper(viscous)] if viscous.any() else []),
-        *([CoulombFriction(dry)] if dry.any() else []),
-        *given,
-    )
-    bound = [each for force in given for each in force.bind(robot)]
+    short = JointSpring(stiffness, rest), JointDamper(viscous), CoulombFriction(dry)
+    acting = [(force, parts) for force in short if (parts := force.bind(robot))]
+    acting += [(force, force.bind(robot)) for force in given]
+    given = tuple(force for force, _ in acting)
+    bound = [each for _, parts in acting for each in parts]
     elements = [each for each in bound if isinstance(each, Element)]
-    for side, name in enumerate(("lower", "upper")):
-        ends = positions[f"the {name} end of the JointStop"] = np.zeros(robot.dof)
-        for element in of_kind(elements, "JointStop"):
-            ends[element.coordinate] = np.nan_to_num(element.values[side], posinf=0.0, neginf=0.0)
-    for name, values in positions.items():
-        if units := degrees_hint(robot, name, values):
-            logger.warning(units)
     own_code = tuple(force for force in given if isinstance(force, CustomForce))
     total = {kind: np.zeros(robot.dof) for kind in _SUMMED}
     for element in elements:
         if element.kind in total:
             total[element.kind][element.coordinate] += element.values[0]
+    slack = np.zeros(robot.dof)
     for c in np.flatnonzero(total["JointSpring"]):
         springs = [element.values for element in of_kind(elements, "JointSpring") if element.coordinate == c]
         first = springs[0][1]
@@ -795,16 +788,6 @@ def _forces(
         "rest": slack,
         "armature": robot.tree.armature + total["Armature"],
     }
-
-
-def _refuse_noisy_servos(models: Sequence[Noise], elements: Sequence[Element], robot: Robot) -> None:
-    """Refuse noise in proportion to the controls of servos: these are positions, whose zero is arbitrary."""
-    servos = of_kind(elements, "PositionServo")
-    if servos and any(isinstance(model, ControlNoise) for model in models):
-        raise InputError(
-            f"ControlNoise is proportional to forces, but the control of joint "
-            f"{robot.joint_names[servos[0].coordinate]!r} is the position of its servo: take AdditiveNoise"
-        )
 
 
 def _is_input(tie: Tied) -> bool:
@@ -836,16 +819,10 @@ def _driven(robot: Robot, actuation: Floats, servos: Sequence[Element], inputs: 
 
 def _with_rates(actuation: Floats, bound: Bound) -> tuple[Floats, Bound]:
     """The actuation with a column of zeros for the velocity of each cubic input, and the ties with these columns."""
-    m, ties = actuation.shape[1], list(bound.rows.ties)
-    cubic = [k for k, tie in enumerate(ties) if tie.rate >= 0]
-    if not cubic:
-        return actuation, bound
-    for k, index in enumerate(cubic):
-        ties[index] = ties[index]._replace(rate=m + k)
-    return (
-        np.hstack([actuation, np.zeros((len(actuation), len(cubic)))]),
-        bound._replace(rows=bound.rows._replace(ties=tuple(ties))),
-    )
+    columns = count(actuation.shape[1])
+    ties = tuple(tie._replace(rate=next(columns)) if tie.rate >= 0 else tie for tie in bound.rows.ties)
+    added = np.zeros((len(actuation), next(columns) - actuation.shape[1]))
+    return np.hstack([actuation, added]), bound._replace(rows=bound.rows._replace(ties=ties))
 
 
 def _actuation(robot: Robot, actuation: ArrayLike | Sequence[str] | None) -> Floats:
