@@ -124,13 +124,15 @@ class JointForce(Force):
             none = _LIMITS.get(name, 0.0)
             values = joint_array(name, getattr(self, name), robot.joint_names, uniform=True, absent=none)
             if name in _LIMITS:
-                _refuse(name, values, np.isnan(values) | (values == -none), f"must be a number, or {none} for none")
+                refuse_where(
+                    name, values, np.isnan(values) | (values == -none), f"must be a number, or {none} for none"
+                )
             if name not in _SIGNED + _POSITIVE:
-                _refuse(name, values, values < 0.0, "must be >= 0")
+                refuse_where(name, values, values < 0.0, "must be >= 0")
             numbers[name] = values
         acts = self.acts(numbers, robot)
         for name in numbers.keys() & set(_POSITIVE):
-            _refuse(name, numbers[name], acts & ~(numbers[name] > 0.0), "must be > 0")
+            refuse_where(name, numbers[name], acts & ~(numbers[name] > 0.0), "must be > 0")
         for name in (name for name in _SIGNED if name in numbers):
             places = np.where(acts & np.isfinite(numbers[name]), numbers[name], 0.0)
             if units := degrees_hint(robot, f"{name} of the {type(self).__name__}", places):
@@ -207,7 +209,7 @@ class CoulombFriction(JointForce):
         breakaway = numbers.setdefault("breakaway", level)
         numbers.setdefault("stribeck_velocity", np.ones_like(level))
         acts = np.maximum(level, breakaway) > 0.0
-        _refuse("breakaway", breakaway, acts & (breakaway < level), "must be at least the level")
+        refuse_where("breakaway", breakaway, acts & (breakaway < level), "must be at least the level")
         return np.asarray(acts)
 
 
@@ -247,7 +249,7 @@ class JointStop(JointForce):
                 f"JointStop: {robot.name} has no position limits for {', '.join(map(repr, endless.tolist()))}: give "
                 "lower= and upper="
             )
-        _refuse("lower", lower, acts & ~(lower < upper), "must be below the upper end")
+        refuse_where("lower", lower, acts & ~(lower < upper), "must be below the upper end")
         return np.asarray(acts)
 
 
@@ -493,7 +495,8 @@ def keeps_energy(coupling: Coupling) -> bool:
     return not COUPLINGS[coupling.kind].force
 
 
-def _refuse(name: str, values: Floats, wrong: Mask, what: str) -> None:
+def refuse_where(name: str, values: Floats, wrong: Mask, what: str) -> None:
+    """Refuse the first of the values (n,) that is wrong."""
     if wrong.any():
         c = int(np.argmax(wrong))
         raise InputError(f"{name}[{c}] is {values[c]}; it {what}")

@@ -40,6 +40,7 @@ from varpin.mechanics.forces import (
     dissipates,
     keeps_energy,
     of_kind,
+    refuse_where,
 )
 from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, bind, models_of
 from varpin.model import Robot, require_robot
@@ -762,6 +763,8 @@ def _forces(
     # Numbers for the damping are a decision on the dry friction, too.
     decided = friction is not None or not (damping is None or is_one_of(damping, ("robot",)))
     dry = resistance("friction", friction, robot.friction, decided=decided or CoulombFriction in kinds)
+    # Its force would call it the level.
+    refuse_where("friction", dry, dry < 0.0, "must be >= 0")
     short = JointSpring(stiffness, rest), JointDamper(viscous), CoulombFriction(dry)
     acting = [(force, parts) for force in short if (parts := force.bind(robot))]
     acting += [(force, force.bind(robot)) for force in given]
