@@ -765,7 +765,7 @@ def _forces(
     dry = resistance("friction", friction, robot.friction, decided=decided or CoulombFriction in kinds)
     # Its force would call it the level.
     refuse_where("friction", dry, dry < 0.0, "must be >= 0")
-    short = JointSpring(stiffness, rest), JointDamper(viscous), CoulombFriction(dry)
+    short: tuple[Force, ...] = (JointSpring(stiffness, rest), JointDamper(viscous), CoulombFriction(dry))
     acting = [(force, parts) for force in short if (parts := force.bind(robot))]
     acting += [(force, force.bind(robot)) for force in given]
     given = tuple(force for force, _ in acting)
