@@ -362,9 +362,9 @@ class Trajectory(Frozen):
         return cls.of_members(source, read_npz(source, FORMAT), robot)
 
     @classmethod
-    def of_members(cls, source: Path, members: Mapping[str, Any], robot: Robot | None, prefix: str = "") -> Trajectory:
-        """The trajectory from the entries of the file ``source`` that begin with ``prefix``; errors as :meth:`load`."""
-        found = record_of(cls, members, source, prefix=prefix)
+    def of_members(cls, source: Path, members: Mapping[str, Any], robot: Robot | None) -> Trajectory:
+        """The trajectory from the entries of the file ``source``; errors as :meth:`load`."""
+        found = record_of(cls, members, source)
         # Energies and momenta overflow before q and v do; they may then be infinite.
         if not np.isfinite(found.p[np.isfinite(found.energy)]).all():
             raise FileError(f"{source}: p holds values that are not finite numbers")

@@ -42,15 +42,10 @@ class SceneFileError(VarpinError, ValueError):
 
 @dataclass(frozen=True)
 class Where:
-    """A place in a scene file.
-
-    Attributes:
-        path: The file.
-        key: The key of a value or a table; empty for the top level.
-    """
+    """A place in a scene file."""
 
     path: Path
-    key: str = ""
+    key: str = ""  # of a value or a table; empty for the top level
 
     def at(self, *names: str | int) -> Where:
         """The place of an entry."""
@@ -69,7 +64,7 @@ class Where:
                 return self.at(key, name).error(str(error))
             # A name, several of them, or a point in a frame.
             parts = value if isinstance(value, list | tuple) else (value,)
-            if name in [part for part in parts if isinstance(part, str)]:
+            if name in [part for own in parts if isinstance(part := getattr(own, "frame", own), str)]:
                 return self.at(key).error(str(error))
         # A name of one letter is a word, too.
         found = {key: re.search(rf"\b{key}\b" if len(key) > 1 else rf"\b{key}(?=,| must)", str(error)) for key in given}
