@@ -218,7 +218,8 @@ def test_limits_are_held_against_what_drives_and_stops_do():
     loose = vp.Scene(robot, gravity=False, forces=[vp.JointStop(1e3, lower=-50, upper=50)])
     assert about(said(loose, [0, 0, 2.9, 0, 0, 0], [0, 0, 6.0, 0, 0, 0], 400), "position limits")
     stiff = vp.Scene(robot, gravity=False, forces=[vp.JointStop(1e5, 1e3)])
-    assert not about(said(stiff, [0, 0, 3.0, 0, 0, 0], [0, 0, 1.0, 0, 0, 0], 400), "position limits")
+    for side in (1.0, -1.0):
+        assert not about(said(stiff, [0, 0, 3.0 * side, 0, 0, 0], [0, 0, side, 0, 0, 0], 400), "position limits")
 
 
 REST = [0.0, -1.0, 1.0, -0.5, 0.8, 0.0]

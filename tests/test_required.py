@@ -200,6 +200,14 @@ def test_what_touches_a_joint_in_python(given, joints):
     assert len(scene.required(0.0, **given).joints) == joints
 
 
+def test_gravity_along_an_axis_touches_no_joint():
+    model = pin.Model()
+    for name in ("one", "two"):
+        joint = model.addJoint(0, pin.JointModelRZ(), pin.SE3.Identity(), name)
+        model.appendBodyToJoint(joint, pin.Inertia.FromSphere(1.0, 0.1), pin.SE3(np.eye(3), np.array([0.3, 0, 0])))
+    assert vp.Scene(vp.load_robot(model)).required(0.0, {"one": 1.0}).joints == ("one",)
+
+
 def test_held_joints_are_those_of_a_robot_that_is_loaded_with_them():
     """Of the damping of mimic joints and of springs, servos and motors, too."""
     lock = {"panda_joint1": 0.3, "panda_joint5": -0.2}
