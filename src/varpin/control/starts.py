@@ -74,7 +74,9 @@ def commands_along(problem: OptimalControlProblem, path: Path, controls: Floats 
     scene, hold, (q, v), u = problem.scene, problem.hold, path, controls
     m = scene.controls
     if u is None:
-        u = as_moved(scene, q[hold::hold], v[hold::hold], _joint_forces(problem, q, v) @ scene.allocation.T)
+        u = as_moved(
+            scene, q[hold::hold], v[hold::hold], _joint_forces(problem, q, v) @ np.linalg.pinv(scene.actuation).T
+        )
         u = np.clip(u, *problem.control_limits)
     q, v = q[:-1:hold], v[:-1:hold]
     if problem.integrator.variational:

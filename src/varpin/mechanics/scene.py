@@ -389,11 +389,6 @@ class Scene(Frozen):
         return np.array_equal(self.actuation, np.eye(self.robot.dof))
 
     @cached_property
-    def allocation(self) -> Floats:
-        """Matrix (m, n) of the smallest controls that give joint forces, or come closest: the pseudoinverse."""
-        return np.asarray(np.linalg.pinv(self.actuation), dtype=np.float64)
-
-    @cached_property
     def controls(self) -> int:
         """m, the number of controls."""
         return int(self.actuation.shape[1])
@@ -495,11 +490,6 @@ class Scene(Frozen):
         bounds = np.array([(lower, upper), (-speed, speed), (-effort, effort)])
         bounds.setflags(write=False)
         return bounds
-
-    @cached_property
-    def direct_efforts(self) -> bool:
-        """Whether the motors' forces are those of the controls: there are neither servos nor kinematic inputs."""
-        return not (self.servo_joints or self.inputs)
 
     @cached_property
     def diffusion(self) -> Diffusion:
