@@ -14,8 +14,6 @@ from refusals import refused
 
 import varpin as vp
 from varpin.control.costs import BoundCost, Cost, Expansion
-from varpin.core.arrays import Diffusion
-from varpin.mechanics.noise import BoundNoise, Noise
 
 ROBOT = vp.planar_chain(2)
 SCENE = vp.Scene(ROBOT)
@@ -144,19 +142,6 @@ def test_ensemble(name, value):
 
 
 class TestTheCoreGetsWhatFits:
-    @pytest.mark.parametrize("field", Diffusion._fields)
-    @pytest.mark.parametrize("value", [np.zeros((1, 1)), np.zeros((9, 9)), None, np.full((2, 2), np.inf, dtype="f4")])
-    def test_noise_of_one_s_own(self, field, value):
-        class Own(Noise):
-            def bind(self, actuation, joints):
-                fields = Diffusion(np.zeros((2, 2)), np.zeros((2, 2, 2)), np.zeros((2, 2)), np.zeros((2, 2)))
-                return BoundNoise(fields._replace(**{field: value}))
-
-        with pytest.raises((vp.InputError, AttributeError)) as info:
-            vp.Scene(ROBOT, noise=Own())
-        # Without the first array not even the number of processes is there.
-        assert info.type is vp.InputError or (field == "constant" and value is None)
-
     @pytest.mark.parametrize(
         ("gradient", "hessian"), [((5, 6), (2, 6, 6)), ((5, 6), (6, 6)), ((5, 1), (1, 6, 6)), ((1, 6), (5, 6, 6))]
     )

@@ -203,7 +203,7 @@ def _outside(problem: OptimalControlProblem) -> Iterator[Finding]:
 def _weights(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Limits of joint torques that cannot hold the arm at rest where it starts, or where it is to end."""
     scene, names = problem.scene, problem.scene.robot.joint_names
-    if not problem.limited or scene.constraints or not (scene.direct and scene.direct_efforts):
+    if not problem.limited or scene.constraints or not scene.direct or scene.servo_joints or scene.inputs:
         return
     postures: list[tuple[str, Floats]] = [] if problem.v0.any() else [("the start", problem.q0)]
     postures += [("the goal of the terminal TrackingCost", end) for end in _postures(problem)]
