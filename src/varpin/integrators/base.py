@@ -90,6 +90,8 @@ class Integrator(ABC):
     variational: bool
     # Whether fast damped modes are at rest after one step.
     l_stable: ClassVar[bool] = False
+    # Whether a step's noise impulse acts after the step as a whole, by the fields at its start.
+    kicks_after: ClassVar[bool] = False
     # Options that the text names even at their defaults.
     named: ClassVar[tuple[str, ...]] = ()
 
@@ -256,11 +258,15 @@ class Compiled(Integrator):
     def state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
         """The q, p and v (n,) of the only path."""
 
-    @abstractmethod
     def kicked(
         self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
     ) -> Segment:
         """One step of the only path under a drift (n,), with a noise impulse (n,) or its first part."""
+        kicks = None
+        if impulse is not None:
+            kicks = np.zeros((1, 1, 2, impulse.size))
+            kicks[0, 0, 0] = self.left * impulse
+        return self.rollout_compiled(scene, state, command, scene.silence, drift[None, None], dt, kicks)[0]
 
     def rollout(self, scene: Scene, state: Run, commands: Commands, increments: Floats, dt: float) -> list[Segment]:
         if scene.noise.diffusion is not None:

@@ -21,7 +21,6 @@ from varpin.integrators.base import (
     first_nodes,
     forces,
 )
-from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.trajectory import Trajectory
 
@@ -66,20 +65,6 @@ class _Explicit(Compiled):
         """See :meth:`Compiled.state_of`; p is none of its own."""
         return state.paths.q[0], state.paths.q[0, :0], state.paths.v[0]
 
-    def kicked(
-        self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
-    ) -> Segment:
-        """See :meth:`Compiled.kicked`.
-
-        The noise impulse is a constant force over the step for explicit Euler, where this is equivalent, and a jump of
-        the velocity before the step for the other methods.
-        """
-        if impulse is not None and self.method is ExplicitMethod.euler:
-            drift = drift + impulse / dt
-        elif impulse is not None:
-            state.paths.v[0] += np.linalg.solve(mass(scene, state.paths.q[0]), impulse)
-        return self.rollout_compiled(scene, state, command, scene.silence, drift[None, None], dt)[0]
-
     def linearize(
         self, scene: Scene, trajectory: Trajectory, *, ramps: bool = False
     ) -> tuple[Floats, Floats, Floats, Floats]:
@@ -104,11 +89,6 @@ class _Explicit(Compiled):
         return in_v
 
 
-def mass(scene: Scene, q: Floats) -> Floats:
-    """M(q) (n, n)."""
-    return lagrangian_jet(scene, q, np.zeros_like(q)).Lvv
-
-
 def accelerations(scene: Scene, q: Floats, v: Floats, force: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Accelerations (N, n) under constant forces, and their derivatives in q, v and force, each (N, n, n).
 
@@ -128,13 +108,19 @@ class ExplicitEuler(_Explicit):
 
     method: ClassVar[ExplicitMethod] = ExplicitMethod.euler
     order = 1
+    kicks_after = True
 
     def damped(self, z: Floats) -> tuple[Floats, Floats]:
-        # Noise adds to the velocity after the step.
         return 1.0 - z, np.ones_like(z)
 
+    def kicked(
+        self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
+    ) -> Segment:
+        # As a constant force over the step, which is the same.
+        drift = drift if impulse is None else drift + impulse / dt
+        return super().kicked(scene, state, command, drift, None, dt)
+
     def _jump(self, in_v: Floats) -> Floats:
-        # Noise adds to the velocity after the step.
         n = in_v.shape[2]
         return np.tile(np.eye(2 * n, n, -n), (len(in_v), 1, 1))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -219,12 +218,10 @@ class Variational(Compiled):
     def kicked(
         self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
     ) -> Segment:
-        held = None
-        if impulse is not None and self.holds_noise:
-            held = np.stack([impulse, np.zeros_like(impulse)])[None, None]
-        elif impulse is not None:
-            state.paths.kick(self.left * impulse[None])
-        return self.rollout_compiled(scene, state, command, scene.silence, drift[None, None], dt, held)[0]
+        if impulse is not None and scene.constraints and not self.holds_noise:
+            state.paths.kick(impulse[None])
+            impulse = None
+        return super().kicked(scene, state, command, drift, impulse, dt)
 
     def linearize(
         self, scene: Scene, trajectory: Trajectory, *, ramps: bool = False
@@ -393,7 +390,6 @@ def _along(scene: Scene, q: Floats) -> Floats:
     return found
 
 
-@functools.lru_cache(maxsize=256)
 def _core_guards(given: Guard | None, balance: float = 1.0, budget: float = 1.0) -> Guards:
     guard = given or Guard(max_halvings=0)
     return Guards.make(

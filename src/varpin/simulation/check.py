@@ -17,7 +17,7 @@ from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands
 from varpin.errors import AssemblyError, SingularMassMatrix
 from varpin.finding import Finding
-from varpin.integrators import ExplicitEuler, Gauss, Integrator, Radau, Reference, RungeKutta4
+from varpin.integrators import Gauss, Integrator, Radau, Reference, RungeKutta4
 from varpin.integrators.base import drifts, noise_impulses
 from varpin.integrators.collocation import MOST_STAGES
 from varpin.integrators.reference import TIGHTEST
@@ -148,8 +148,7 @@ def closer(
         factor = 0.1 if 0.1 * integrator.rtol >= TIGHTEST else 10.0
         other = Reference(factor * integrator.rtol, None if integrator.atol is None else factor * integrator.atol)
         return other, 1, factor
-    if trajectory.noisy and isinstance(integrator, ExplicitEuler):
-        # Its kicks come after the step.
+    if trajectory.noisy and integrator.kicks_after:
         return integrator, 2, 0.5
     own = isinstance(integrator, RungeKutta4)
     if (own and not sampled) or (fed and not integrator.variational):
@@ -276,8 +275,7 @@ def _noise(
         drawn = np.zeros((1, N * parts, trajectory.dw.shape[1]))
         drawn[0, ::parts] = trajectory.dw
         return drawn, None
-    # Explicit Euler's kicks come after the step.
-    before = 0.0 if isinstance(integrator, ExplicitEuler) else integrator.left
+    before = 0.0 if integrator.kicks_after else integrator.left
 
     def impulses(share: float, node: Integers) -> Floats:
         at = trajectory.q[node], trajectory.v[node]
