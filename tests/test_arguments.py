@@ -110,7 +110,7 @@ FUNCTIONS = {
         ensemble,
         ("q0", "v0", "dt", "steps", "paths", "rng", "controls", "quantiles", "store", "progress", "integrator"),
     ),
-    "LinearPolicy": (fed, ("u", "gains", "reference", "hold", "on", "limits", "before", "period", "previous_gains")),
+    "policy": (fed, ("u", "gains", "reference", "hold", "on", "limits", "before", "period", "previous_gains")),
     "OpenLoop": (lambda **given: motion(controls=vp.OpenLoop(**given)), ("f",)),
     "Midpoint": (lambda **given: motion(integrator=vp.Midpoint(**given)), ("alpha", "guard", "tolerance", "kick")),
     "Gauss": (lambda **given: motion(integrator=vp.Gauss(**given)), ("stages",)),
