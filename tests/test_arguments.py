@@ -23,6 +23,7 @@ from varpin.mechanics.noise import BoundNoise, Noise
 ROBOT = vp.planar_chain(2)
 SCENE, NOISY = vp.Scene(ROBOT), vp.Scene(ROBOT, noise=vp.AdditiveNoise(1e-3))
 CLEAR = {"obstacles": [vp.Obstacle.sphere([2, 0, 0], 0.1)], "capsules": {"tip": ([0, 0, 0], [0, 0, -1.0], 0.05)}}
+FINER = {"increments": [[0.1], [0.2]], "dt": 0.1, "rng": 0}
 
 extremes = [0.0, -0.0, 1.0, -1.0, 1e-320, 1e-160, 1e160, -1e160, 1e308, np.inf, np.nan]
 numbers = st.floats() | st.sampled_from(extremes)
@@ -46,9 +47,7 @@ anything = st.one_of(
     st.lists(numbers | st.lists(numbers, max_size=3), max_size=3),
     st.sampled_from([[0.1, 0.2], np.array([0.1, 0.2])[::-1], np.asfortranarray(np.ones((5, 2))), {}, {"a": 1}, b"ab"]),
     st.dictionaries(st.sampled_from(["joint1", "joint2", "a", 1]), numbers | st.text(max_size=2), max_size=2),
-    st.sampled_from(
-        [object(), vp.Midpoint, ROBOT, SCENE, 10**15, lambda: None, lambda t: [0, 0], ["joint1", "joint1"]]
-    ),
+    st.sampled_from([object(), ROBOT, SCENE, 10**15, lambda: None, lambda t: [0, 0], ["joint1", "joint1"]]),
 )
 SETTINGS = settings(max_examples=30, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 
@@ -121,6 +120,8 @@ FUNCTIONS = {
     "discrete_lagrangian": (discrete, ("q0", "q1", "dt", "alpha")),
     "configuration": (ROBOT.configuration, ("q",)),
     "propagate_moments": (vp.propagate_moments, ("linearization",)),
+    "refine": (lambda **given: vp.wiener.refine(**(FINER | given)), ("increments", "dt", "rng")),
+    "wiener_increments": (lambda dt: vp.wiener.wiener_increments(1, dt, 3, rng=0), ("dt",)),
     "KeepClear": (lambda **given: vp.KeepClear(ROBOT, **(CLEAR | given)), ("obstacles", "links", "capsules", "itself")),
     "AdditiveNoise": (noise_of(vp.AdditiveNoise), ("intensity",)),
     "ControlNoise": (noise_of(vp.ControlNoise), ("intensity",)),
