@@ -95,7 +95,7 @@ def noise_of(kind):
 
 # Each argument of a function is given anything; the others keep their defaults.
 FUNCTIONS = {
-    "planar_chain": (lambda links=2, **given: vp.planar_chain(links, **given), ("links", "length", "mass")),
+    "robot": (lambda links=2, **given: vp.planar_chain(links, **given), ("links", "length", "mass")),
     "load_robot": (lambda **given: vp.load_robot("ur5", **given), ("package_dirs", "mimic", "lock")),
     "Scene": (
         of_scene,
@@ -117,12 +117,13 @@ FUNCTIONS = {
     "Guard": (guarded, ("branch_margin", "energy_balance", "energy_budget", "max_halvings")),
     "solve": (plan, ("t0", "q0", "v0", "check", "second_order", "time_limit", "integrator")),
     "lagrangian_jet": (jet, ("q", "v", "backend")),
-    "discrete_lagrangian": (discrete, ("q0", "q1", "dt", "alpha")),
+    "v": (discrete, ("q0", "q1", "dt", "alpha")),
     "configuration": (ROBOT.configuration, ("q",)),
     "propagate_moments": (vp.propagate_moments, ("linearization",)),
     "refine": (lambda **given: vp.wiener.refine(**(FINER | given)), ("increments", "dt", "rng")),
     "wiener_increments": (lambda dt: vp.wiener.wiener_increments(1, dt, 3, rng=0), ("dt",)),
-    "KeepClear": (lambda **given: vp.KeepClear(ROBOT, **(CLEAR | given)), ("obstacles", "links", "capsules", "itself")),
+    "KeepClear": (lambda **given: vp.KeepClear(ROBOT, **(CLEAR | given)), ("obstacles", "capsules", "itself")),
+    "link": (lambda links: vp.KeepClear(ROBOT, **CLEAR, links=links), ("links",)),
     "AdditiveNoise": (noise_of(vp.AdditiveNoise), ("intensity",)),
     "ControlNoise": (noise_of(vp.ControlNoise), ("intensity",)),
     "StateNoise": (noise_of(vp.StateNoise), ("intensity",)),
