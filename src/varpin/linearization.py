@@ -138,26 +138,16 @@ def linearize_steps(
     n, m, steps = scene.robot.dof, scene.controls, trajectory.steps
     Jx, Jf, Jk, Jr = integrator.linearize(scene, trajectory, ramps=ramps)
     ramp = Jr @ scene.transmission if ramps else None
-    q, v = trajectory.q, trajectory.v
+    q, v, K = trajectory.q, trajectory.v, Jk if integrator.variational else np.zeros((steps, 2 * n, 0))
     if ramp is not None and scene.inputs:
         # Only the end of a step counts.
         ramp[:, :, scene.prescribed] = (Jf @ scene.transmission)[:, :, scene.prescribed]
     if scene.processes == 0:
-        return Linearization(
-            A=Jx,
-            # One product instead of many small ones.
-            B=Jf if scene.direct else (Jf.reshape(-1, Jf.shape[2]) @ scene.transmission).reshape(steps, 2 * n, m),
-            K=Jk if integrator.variational else np.zeros((steps, 2 * n, 0)),
-            J=Jk,
-            F=np.zeros((steps, n, 0)),
-            G=np.zeros((steps, 2 * n, 0)),
-            Gx=np.zeros((steps, 2 * n, 0, 2 * n)),
-            Gu=np.zeros((steps, 2 * n, 0, m)),
-            dt=trajectory.dt,
-            variational=integrator.variational,
-            ramp=ramp,
-            Gramp=None if ramp is None else np.zeros((steps, 2 * n, 0, m)),
-        )
+        # One product instead of many small ones.
+        B = Jf if scene.direct else (Jf.reshape(-1, Jf.shape[2]) @ scene.transmission).reshape(steps, 2 * n, m)
+        F, G, Gx, Gu = (np.zeros((steps, *shape)) for shape in ((n, 0), (2 * n, 0), (2 * n, 0, 2 * n), (2 * n, 0, m)))
+        slopes = ramp, None if ramp is None else Gu
+        return Linearization(Jx, B, K, Jk, F, G, Gx, Gu, trajectory.dt, integrator.variational, *slopes)
     start = noise_fields(scene, trajectory, q[:-1], v[:-1], first)
     A, B = Jx, Jf @ scene.transmission
     if start.Fv is not None:
@@ -195,20 +185,8 @@ def linearize_steps(
     if Gramp is not None and scene.inputs:
         # As of the step itself, only the end counts.
         Gramp[..., scene.prescribed] = Gu[..., scene.prescribed]
-    return Linearization(
-        A=A,
-        B=B,
-        K=Jk if integrator.variational else np.zeros((steps, 2 * n, 0)),
-        J=Jk,
-        F=np.broadcast_to(start.F[:, :, : scene.processes], (steps, n, scene.processes)),
-        G=G,
-        Gx=Gx,
-        Gu=Gu,
-        dt=trajectory.dt,
-        variational=integrator.variational,
-        ramp=ramp,
-        Gramp=Gramp,
-    )
+    F = np.broadcast_to(start.F[:, :, : scene.processes], (steps, n, scene.processes))
+    return Linearization(A, B, K, Jk, F, G, Gx, Gu, trajectory.dt, integrator.variational, ramp, Gramp)
 
 
 @dataclass(frozen=True, eq=False)

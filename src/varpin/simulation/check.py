@@ -31,8 +31,8 @@ from varpin.signals.controls import Controls, commands_of
 from varpin.signals.functions import Sampled, left_by_stages
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.gate import proven_error
-from varpin.simulation.law import Law, law_of
 from varpin.simulation.limits import beyond_limits
+from varpin.simulation.loop import Law, law_of
 from varpin.simulation.spectrum import contact_rate, fastest_rate, speed_scales, travel_scales
 from varpin.simulation.start import finer
 from varpin.simulation.velocity_noise import wrong_spread
