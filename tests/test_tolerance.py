@@ -194,7 +194,7 @@ def law(t, q, v):
         ({"duration": 1.0, "tolerance": 1e-6, "controls": law}, "tolerance"),
         ({"duration": 1.0, "tolerance": 1e-6, "controls": np.ones((4, 2))}, ("controls", "(R, 3)")),
         ({"duration": 1.0, "tolerance": 1e-6, "controls": policy(None, None)}, "period"),
-        ({"duration": 1.0, "tolerance": 1e-6, "controls": policy(None)}, ("10", "0.05", "0.5")),
+        ({"duration": 1.0, "tolerance": 1e-6, "controls": policy(None)}, ("0.05 s", "0.1 s")),
         ({"duration": 1.0, "tolerance": 1e-6, "integrator": vp.Reference()}, "rtol"),
         ({"duration": 1.0, "tolerance": 1e-6, "integrator": "Midpoint"}, "integrator"),
         ({"duration": 1.0}, ("dt", "duration")),

@@ -9,7 +9,7 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -90,6 +90,8 @@ class Integrator(ABC):
     variational: bool
     # Whether fast damped modes are at rest after one step.
     l_stable: ClassVar[bool] = False
+    # When the noise impulse of a step acts, see :class:`Midpoint`.
+    kick: Literal["left", "split", "held"] = "left"
     # Whether a step's noise impulse acts after the step as a whole, by the fields at its start.
     kicks_after: ClassVar[bool] = False
     # Options that the text names even at their defaults.
@@ -127,12 +129,12 @@ class Integrator(ABC):
     @property
     def left(self) -> float:
         """The share of a step's noise impulse that acts before the step; the rest acts after it."""
-        return 1.0
+        return 0.5 if self.kick == "split" else 1.0
 
     @property
     def holds_noise(self) -> bool:
         """Whether the noise of a step is a force that is constant over it, instead of impulses at its ends."""
-        return False
+        return self.kick == "held"
 
     @property
     def drift_share(self) -> float:

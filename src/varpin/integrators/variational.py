@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -99,7 +99,6 @@ class Variational(Compiled):
 
     guard: Guard | None
     tolerance: float
-    kick: Literal["left", "split", "held"]
 
     variational = True
     reasons = REASONS
@@ -115,14 +114,6 @@ class Variational(Compiled):
         positive("tolerance", self.tolerance, "rounding units")
         if not is_one_of(self.kick, ("left", "split", "held")):
             raise InputError(f"kick must be 'left', 'split' or 'held', got {self.kick!r}")
-
-    @property
-    def left(self) -> float:
-        return 0.5 if self.kick == "split" else 1.0
-
-    @property
-    def holds_noise(self) -> bool:
-        return self.kick == "held"
 
     def damped(self, z: Floats) -> tuple[Floats, Floats]:
         """See :meth:`Integrator.damped`."""

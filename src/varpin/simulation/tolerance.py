@@ -203,8 +203,7 @@ class Ladder:
     def for_tolerance(self, wish: float) -> tuple[list[Trial], bool]:
         """The methods at the steps that meet an error [rad or m], the cheapest first, and whether one does.
 
-        The first was tried at its steps; others may be predicted. If none meets the error, they are at the steps of
-        their least errors, the most accurate first.
+        If none meets it, they are at the steps of their least errors, the most accurate first.
         """
         self._find_first()
         while not self.late():
@@ -292,7 +291,7 @@ class _Search:
             self.controls = control_rows(scene, controls)
             self.rows = len(self.controls)
         if isinstance(controls, LinearPolicy):
-            self.rows = _intervals(controls, duration)
+            self.rows = len(controls.gains)
         elif isinstance(controls, FirstOrderHold):
             self.rows = len(controls.u) - 1
         self.most = _MOST_WORK / len(q0)
@@ -371,9 +370,7 @@ def steps_for_tolerance(
     wanted: Controls | ControlLaw,
     integrator: Integrator | None,
 ) -> Chosen:
-    """Integrator, number of steps and controls for a tolerance [rad or m], with the accuracy, the error and warnings.
-
-    ``wanted`` are the controls, ``integrator`` is the only one to consider, None for all.
+    """What meets a tolerance [rad or m] under the controls ``wanted``, by one ``integrator`` or any.
 
     Raises:
         InputError: The scene, the controls or the integrator are none that a tolerance can choose steps for.
@@ -403,7 +400,7 @@ def steps_for_tolerance(
     ladder = Ladder(search.attempt, members, coarse, search.rows, lambda: search.evaluations > search.most)
     try:
         found = ladder.for_tolerance(max(wish, floor))[0][0]
-    except (StepError, CustomForceError, CustomConstraintError):
+    except (StepError, InputError):
         raise
     except VarpinError:
         raise ToleranceError(wish, duration, coarse, math.inf) from None
@@ -420,18 +417,3 @@ def steps_for_tolerance(
     told = () if record.met else (Finding("tolerance not met", text, value=record.error, unit="rad or m"),)
     error = search.errors[str(found.integrator), found.steps]
     return Chosen(found.integrator, found.steps, search.given(found.steps), record, told, error)
-
-
-def _intervals(policy: LinearPolicy, duration: float) -> int:
-    """The number of a policy's intervals over a motion whose steps a tolerance chooses."""
-    if policy.linear:
-        raise InputError("tolerance chooses dt, and a policy whose controls are linear between nodes takes it: dt=")
-    if policy.period is None:
-        raise InputError("tolerance chooses dt, so a LinearPolicy needs the period of its intervals, period= [s]")
-    parts = len(policy.gains)
-    if abs(parts * policy.period - duration) > 1e-9 * duration:
-        raise InputError(
-            f"the policy has {parts} intervals of {policy.period:g} s, {parts * policy.period:g} s in all, and "
-            f"duration = {duration:g} s"
-        )
-    return parts
