@@ -5,7 +5,6 @@ Equation (N1) of docs/mathematics.md, the Ito correction; (1.3) of the paper.
 
 from __future__ import annotations
 
-import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
@@ -496,19 +495,3 @@ def segments_of(nodes: RolloutArrays, reasons: Mapping[int, str], paths: Any = N
         failure = Failure(reasons[ended], float(nodes.quality[i, done, 0])) if ended in reasons else None
         segments.append(Segment(**own, statistics=statistics, failure=failure))
     return segments
-
-
-def first_nodes(q: Floats, p: Floats, v: Floats, energy: Floats, controls: int) -> list[Segment]:
-    """A segment of one node for each of P paths, from q, p and v (P, n) and energies (P,) at their starts."""
-    u, statistics = np.zeros((1, controls)), _no_statistics()
-    rows = (slice(i, i + 1) for i in range(len(q)))
-    return [Segment(q[row], p[row], v[row], u, energy[row], statistics) for row in rows]
-
-
-@functools.cache
-def _no_statistics() -> StepStatistics:
-    """The statistics of a first node, read-only."""
-    none, zero, halvings = np.zeros(1, dtype=np.int64), np.zeros(1), np.zeros(0, dtype=np.uint8)
-    for array in (none, zero, halvings):
-        array.setflags(write=False)
-    return StepStatistics(none, none, none, none, halvings, zero, zero, zero)

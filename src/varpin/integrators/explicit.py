@@ -18,8 +18,8 @@ from varpin.integrators.base import (
     Run,
     Segment,
     drifts,
-    first_nodes,
     forces,
+    segments_of,
 )
 from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.trajectory import Trajectory
@@ -43,12 +43,10 @@ class _Explicit(Compiled):
         refuse_constraints(scene, self)
         if scene.custom is not None:
             scene.custom.check(q0, v0)
-        paths, n = q0.shape
-        run, nodes = self.begun(scene, q0, v0), new_nodes(paths, 1, n, scene.controls)
+        run, nodes = self.begun(scene, q0, v0), new_nodes(len(q0), 1, scene.robot.dof, scene.controls)
         if not run.paths.first_nodes(nodes):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
-        q, p, v, energy = (part[:, 0] for part in (nodes.q, nodes.p, nodes.v, nodes.energy))
-        return run, first_nodes(q, p, v, energy, scene.controls)
+        return run, segments_of(nodes, REASONS)
 
     def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
         return Run(core.ExplicitRollout.start(scene.core, self.method, q0, v0), q0.copy())

@@ -17,7 +17,7 @@ from varpin.core import (
     Tableau,
     constrained_derivatives,
 )
-from varpin.core.arrays import Commands, RolloutArrays
+from varpin.core.arrays import Commands, RolloutArrays, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
     Compiled,
@@ -25,8 +25,8 @@ from varpin.integrators.base import (
     Run,
     Segment,
     drifts,
-    first_nodes,
     forces,
+    segments_of,
     without_inputs,
     written,
 )
@@ -183,8 +183,10 @@ class Variational(Compiled):
         if scene.custom is not None:
             scene.custom.check(q0, v0)
         run = self.begun(scene, q0, v0)
-        q, p, v, energy = run.paths.nodes()
-        return run, first_nodes(q, p, v, energy, scene.controls)
+        nodes = new_nodes(len(q0), 1, scene.robot.dof, scene.controls)
+        nodes.q[:, 0], nodes.p[:, 0], nodes.v[:, 0], nodes.energy[:, 0] = run.paths.nodes()
+        nodes.done[:] = 1
+        return run, segments_of(nodes, REASONS)
 
     def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
         """See :meth:`Compiled.begun`."""
