@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.core.arrays import Commands
 from varpin.errors import InputError, StepError, VarpinError
 from varpin.finding import Finding
 from varpin.integrators import (
@@ -33,7 +32,7 @@ from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.signals.commands import held_in_parts, open_loop
+from varpin.signals.commands import held_in_parts
 from varpin.signals.controls import Controls, commands_of, control_rows
 from varpin.signals.functions import ControlLaw, Sampled
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
@@ -284,16 +283,15 @@ class _Search:
     def __init__(self, scene: Scene, q0: Floats, v0: Floats, duration: float, controls: Controls) -> None:
         self.scene, self.q0, self.v0, self.duration = scene, q0, v0, duration
         self.controls: Floats | LinearPolicy | OpenLoop | FirstOrderHold
-        self.rows = 1
-        if isinstance(controls, LinearPolicy | OpenLoop | FirstOrderHold):
-            self.controls = controls
+        if isinstance(controls, OpenLoop):
+            self.controls, self.rows = controls, 1
+        elif isinstance(controls, LinearPolicy):
+            self.controls, self.rows = controls, len(controls.gains)
+        elif isinstance(controls, FirstOrderHold):
+            self.controls, self.rows = controls, len(controls.u) - 1
         else:
             self.controls = control_rows(scene, controls)
             self.rows = len(self.controls)
-        if isinstance(controls, LinearPolicy):
-            self.rows = len(controls.gains)
-        elif isinstance(controls, FirstOrderHold):
-            self.rows = len(controls.u) - 1
         self.most = _MOST_WORK / len(q0)
         self.steps = self.evaluations = 0
         self.errors: dict[tuple[str, int], Floats] = {}
@@ -318,13 +316,6 @@ class _Search:
             return controls
         return held_in_parts(self.scene, controls, *start, span, parts)
 
-    def commands(self, integrator: Integrator, steps: int) -> Commands:
-        """The same as commands of the core."""
-        controls = self.given(steps)
-        if isinstance(controls, np.ndarray):
-            return open_loop(controls)
-        return commands_of(self.scene, integrator, controls, steps, self.duration / steps)
-
     def attempt(self, integrator: Integrator, steps: int) -> Trial:
         """A motion with its error and work; a VarpinError if a user's function has failed in all of many trials."""
         if steps > self.most:
@@ -332,7 +323,7 @@ class _Search:
             self.evaluations += steps
             return Trial(integrator, steps, math.inf, math.inf)
         dt, controls = self.duration / steps, self.given(steps)
-        commands = self.commands(integrator, steps)
+        commands = commands_of(self.scene, integrator, controls, steps, dt)
         try:
             motion, failure = Motions(self.scene, integrator, self.q0, self.v0, dt).under(commands)
             work = motion.statistics.jets.sum() + motion.statistics.sweeps.sum()
