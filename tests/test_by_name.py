@@ -74,10 +74,10 @@ def test_holding_torque_is_pinocchios_gravity_and_the_springs(name):
     rng = np.random.default_rng(3)
     q, stiffness, rest = rng.uniform(-1, 1, (3, robot.dof))
     scene = vp.Scene(robot, gravity=(1.0, -2.0, -7.0), stiffness=np.abs(stiffness), rest=rest)
-    model = robot.free_model.copy()
+    model = robot.model.copy()
     model.gravity = pin.Motion(np.array([1.0, -2.0, -7.0]), np.zeros(3))
-    pull = pin.computeGeneralizedGravity(model, model.createData(), robot.free_positions(q))
-    expected = robot.free_velocities(np.eye(robot.dof)) @ pull + np.abs(stiffness) * (q - rest)
+    pull = pin.computeGeneralizedGravity(model, model.createData(), robot.configuration(q))
+    expected = robot.velocity(np.eye(robot.dof)) @ pull + np.abs(stiffness) * (q - rest)
     np.testing.assert_allclose(scene.holding_torque(q), expected, atol=1e-10)
     np.testing.assert_allclose(scene.holding_controls(q), expected, atol=1e-10)
 

@@ -175,7 +175,7 @@ def test_frames_are_listed_with_what_carries_them():
     """Each by a name that varpin finds; the chain of parents ends at the world, and passes the joint that moves it."""
     robot = vp.load_robot("ur5")
     report = inspect_robot(robot)
-    model = robot.free_model
+    model = robot.model
     assert [frame.name for frame in report.frames] == [frame.name for frame in list(model.frames)[1:]]
     frames = {frame.name: frame for frame in report.frames}
     q = np.zeros((1, 6))

@@ -231,7 +231,7 @@ def test_a_box_is_a_box_in_every_file(tmp_path, caplog, name):
     (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     path = arm(tmp_path, name, scale)
     robot = vp.load_robot(path, inertia="meshes")
-    body = robot.free_model.inertias[2]
+    body = robot.model.inertias[2]
     assert body.mass == pytest.approx(6.0, rel=1e-6)
     np.testing.assert_allclose(body.lever, 0.5 * SIDES, atol=1e-7)
     moments = 6.0 / 12.0 * ((SIDES**2).sum() - SIDES**2)

@@ -344,9 +344,9 @@ def test_robots_side_by_side_keep_their_own_motions(browser, ur5, sweep, tmp_pat
     for k, (robot, q) in enumerate([(ur5, sweep[15]), (ur5, sweep[::-1][15]), (finger, bend[-1])]):
         number = f" {k + 1}" if k else ""
         shift = pose(browser, [f"robot{number}"])[:3, 3]
-        shapes, model = geometry(robot), robot.free_model
+        shapes, model = geometry(robot), robot.model
         at, data = shapes.createData(), model.createData()
-        pin.updateGeometryPlacements(model, data, shapes, at, robot.free_positions(q))
+        pin.updateGeometryPlacements(model, data, shapes, at, robot.configuration(q))
         for index, found in shape_poses(browser, f"robot{number}").items():
             np.testing.assert_allclose(found[:3, 3], at.oMg[index].translation + shift, atol=2e-5)
         goal = pose(browser, [f"notes{number}", names(browser, [f"notes{number}"])[-1]])[:3, 3]
@@ -365,11 +365,11 @@ def test_robots_beside_each_other_do_not_overlap(ur5, sweep, tmp_path):
         if command["type"] == "set_transform" and command["path"] == "/meshcat/robot 2"
     ]
     assert move[2] == 0.0
-    model, shapes = ur5.free_model, geometry(ur5)
+    model, shapes = ur5.model, geometry(ur5)
     data, at = model.createData(), shapes.createData()
     spans = []
     for q in sweep:
-        pin.updateGeometryPlacements(model, data, shapes, at, ur5.free_positions(q))
+        pin.updateGeometryPlacements(model, data, shapes, at, ur5.configuration(q))
         for shape, placed in zip(shapes.geometryObjects, at.oMg, strict=True):
             corners = np.asarray(shape.geometry.vertices()) @ placed.rotation.T + placed.translation
             spans.append(corners @ move)

@@ -101,7 +101,7 @@ def test_locked_joints_are_no_bodies():
 
 def two_joint_panda(lock):
     """panda_joint2 and panda_joint4 with everything they carry, added up link by link."""
-    model = vp.load_robot("panda").free_model
+    model = vp.load_robot("panda").model
     data, q = model.createData(), pin.neutral(model)
     for name, value in (lock | {"panda_finger_joint2": 0.02}).items():
         q[model.joints[model.getJointId(name)].idx_q] = value

@@ -14,7 +14,7 @@ RNG = np.random.default_rng(5)
 
 def mass_and_gravity(robot, q):
     """M and the gravity torques by Pinocchio, of the robot's own model."""
-    model = robot.free_model
+    model = robot.model
     data = model.createData()
     M = pin.crba(model, data, q)
     return np.triu(M) + np.triu(M, 1).T, pin.computeGeneralizedGravity(model, data, q)
@@ -146,15 +146,15 @@ class TestMeshInertias:
         )
         lower = box((0.1, 0.4, 0.3), (0.05, 0.2, 0.25))
         for joint, expected in ((1, upper), (2, lower)):
-            own = robot.free_model.inertias[joint]
+            own = robot.model.inertias[joint]
             # Meshes are read in single precision.
             np.testing.assert_allclose(own.matrix(), expected.matrix(), rtol=0, atol=2e-6)
 
     def test_links_with_an_inertial_keep_it(self, tmp_path):
         inertial = '<inertial><mass value="3"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
         robot = vp.load_robot(written(tmp_path, inertial=inertial), inertia="meshes")
-        assert robot.free_model.inertias[1].mass == 3.0
-        assert robot.free_model.inertias[2].mass == pytest.approx(1000.0 * 0.1 * 0.4 * 0.3)
+        assert robot.model.inertias[1].mass == 3.0
+        assert robot.model.inertias[2].mass == pytest.approx(1000.0 * 0.1 * 0.4 * 0.3)
 
     def test_open_and_missing_meshes_are_named(self, tmp_path):
         with refused(vp.RobotError, "'lower'", "box.obj"):

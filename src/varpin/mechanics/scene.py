@@ -717,7 +717,7 @@ def require_scene(scene: object) -> Scene:
 def _gravity(gravity: ArrayLike | bool, robot: Robot) -> Floats:
     """Gravity (3,) [m/s^2] from the argument of a scene."""
     if isinstance(gravity, bool | np.bool_):
-        return finite_array("gravity of the robot", robot.free_model.gravity.linear, (3,)) if gravity else np.zeros(3)
+        return finite_array("gravity of the robot", robot.model.gravity.linear, (3,)) if gravity else np.zeros(3)
     given = as_floats("gravity", gravity)
     if given.ndim == 0 and np.isfinite(given):
         meant = f"({', '.join(f'{g:g}' for g in (0.0, 0.0, -abs(float(given))))})" if given else "False"

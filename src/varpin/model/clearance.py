@@ -339,7 +339,7 @@ def clearance(
     names = list(dict.fromkeys([*fitted, *given])) if links is None else list(links)
     bodies = []
     for name in names:
-        body, _, _ = place_of_frame(robot.free_model, name, robot.name)
+        body, _, _ = place_of_frame(robot.model, name, robot.name)
         if name in given:
             begin, end, radius = given[name]
             shape = (
@@ -353,7 +353,7 @@ def clearance(
             raise InputError(f"link {name!r} of robot {robot.name!r} has no shape; give capsules={{{name!r}: ...}}")
         # A link that no joint moves is fixed in the world.
         if body < 0:
-            _, R, p = place_of_frame(robot.free_model, name, robot.name)
+            _, R, p = place_of_frame(robot.model, name, robot.name)
             shape = R @ shape[0] + p, R @ shape[1] + p, shape[2]
         solid = Obstacle(name, *shape, None, np.eye(3))
         bodies.append((body, _Body(solid, None if body < 0 else frame_kinematics(robot, name))))
@@ -396,7 +396,7 @@ def _disabled(robot: Robot, srdf: Path | None) -> set[frozenset[str]]:
     root = read_xml(srdf)
     pairs = {frozenset((e.get("link1", ""), e.get("link2", ""))) for e in root.findall("disable_collisions")}
     links = {link for pair in pairs for link in pair}
-    if links.isdisjoint(frame.name for frame in robot.free_model.frames):
+    if links.isdisjoint(frame.name for frame in robot.model.frames):
         raise InputError(f"{srdf} leaves out no pair of links of robot {robot.name!r}: give the robot's own SRDF")
     return pairs
 
@@ -408,7 +408,7 @@ def _vertices(robot: Robot) -> dict[str, Floats]:
     for _, what in faulty.values():
         raise RobotError(what)
     for shape in shapes.geometryObjects:
-        frame = robot.free_model.frames[shape.parentFrame]
+        frame = robot.model.frames[shape.parentFrame]
         place = frame.placement.inverse()
         found.setdefault(frame.name, []).append(shape_points(shape) @ place.rotation.T + place.translation)
     return {name: np.vstack(parts) for name, parts in found.items()}

@@ -97,7 +97,7 @@ class FrameKinematics(Frozen):
 
 def frame_kinematics(robot: Robot, frame: str) -> FrameKinematics:
     """A frame by its name; an InputError if no joint moves it."""
-    body, rotation, translation = place_of_frame(robot.free_model, frame, robot.name)
+    body, rotation, translation = place_of_frame(robot.model, frame, robot.name)
     if body < 0:
         raise InputError(f"frame {frame!r} of robot {robot.name!r} is fixed to the base: no joint moves it")
     return FrameKinematics(frame, links(robot.tree, body), rotation, translation)

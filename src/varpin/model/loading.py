@@ -111,7 +111,7 @@ def load_robot(
     robot = assemble(whole, lock=lock, keep=keep, payload=payload, base=base, armature=armature)
     for note in robot.notes:
         logger.info("robot %r: %s", robot.name, note)
-    wrong = (*robot.faults, *faults(robot.free_model, robot.inertials))
+    wrong = (*robot.faults, *faults(robot.model, robot.inertials))
     for remark in (*robot.remarks, *wrong, *robot.limit_remarks()):
         logger.warning("robot %r: %s", robot.name, remark)
     check_inertia(robot)
@@ -129,8 +129,8 @@ def assemble(
 ) -> Robot:
     """A robot as its source describes it, with the options of :func:`load_robot`; its inertia is not checked."""
     robot = _on_base(robot, base)
-    carry(robot.free_model, (payload,) if isinstance(payload, Payload) else payload, robot.name)
-    names = list(robot.free_model.names)
+    carry(robot.model, (payload,) if isinstance(payload, Payload) else payload, robot.name)
+    names = list(robot.model.names)
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise RobotError(f"robot {robot.name!r} has several joints named {', '.join(map(repr, twice))}")
     robot = hold_joints(robot, _locks(robot, lock, keep))
@@ -145,7 +145,7 @@ def _on_base(robot: Robot, base: Base) -> Robot:
         return robot.rebuilt(place=transform(base, "base", ", or 'planar'"))
     if base != "planar":
         raise InputError(f"base must be 'planar', a transform (4, 4) or a pin.SE3, got {base!r}")
-    if taken := sorted(set(PLANAR) & set(robot.free_model.names)):
+    if taken := sorted(set(PLANAR) & set(robot.model.names)):
         raise InputError(f"base='planar' adds the joints {', '.join(PLANAR)}, but the robot already has {taken[0]!r}")
     kinds = pin.JointModelPX(), pin.JointModelPY(), pin.JointModelRZ()
     return robot.rebuilt(root=tuple(zip(PLANAR, kinds, strict=True)))
@@ -166,7 +166,7 @@ def transform(base: ArrayLike | pin.SE3, what: str, otherwise: str = "") -> pin.
 
 def _with_rotors(robot: Robot, armature: JointValues) -> Robot:
     """The robot with another armature of its coordinates, a number, (n,) or by joint name; locked joints have none."""
-    model, names = robot.free_model, robot.joint_names
+    model, names = robot.model, robot.joint_names
     indices = [model.joints[model.getJointId(name)].idx_v for name in names]
     armatures = np.array(model.armature)[indices]
     if not isinstance(armature, Mapping):
@@ -182,7 +182,7 @@ def _with_rotors(robot: Robot, armature: JointValues) -> Robot:
     values = np.array(model.armature)
     values[indices] = armatures
     model.armature = values
-    return robot.changed(free_model=model)
+    return robot.changed(model=model)
 
 
 def _locks(robot: Robot, lock: Mapping[str, ArrayLike] | None, keep: Sequence[str] | None) -> Mapping[str, ArrayLike]:
@@ -194,7 +194,7 @@ def _locks(robot: Robot, lock: Mapping[str, ArrayLike] | None, keep: Sequence[st
         return given
     if isinstance(keep, str | Mapping) or not isinstance(keep, Iterable):
         raise InputError(f"keep must be a list of joint names, got {keep!r}")
-    keep, model = tuple(keep), robot.free_model
+    keep, model = tuple(keep), robot.model
     leaders = {model.names[tie.follower]: model.names[tie.leader] for tie in robot.ties}
     for name in keep:
         if name not in joint_index(model):
@@ -223,11 +223,9 @@ def _locks(robot: Robot, lock: Mapping[str, ArrayLike] | None, keep: Sequence[st
 def hold_joints(robot: Robot, lock: Mapping[str, ArrayLike]) -> Robot:
     """A robot that is no combined one, with joints locked at positions by name [rad or m].
 
-    Followers of locked leaders are locked as well. Continuous joints among leaders and followers become revolute joints
-    without limits: a (cos, sin) pair loses whole turns, which matter to a gear, and Pinocchio cannot tie such a joint
-    to one of another kind.
+    Followers of locked leaders are locked as well.
     """
-    model, index = robot.free_model, joint_index(robot.free_model)
+    model, index = robot.model, joint_index(robot.model)
     leaders = {tie.follower: tie for tie in robot.ties}
     positions: dict[int, Floats] = {}
     for name, value in lock.items():
@@ -242,10 +240,8 @@ def hold_joints(robot: Robot, lock: Mapping[str, ArrayLike]) -> Robot:
         if tie.leader in positions:
             positions[tie.follower] = tie.ratio * positions[tie.leader] + tie.offset
     held = {joint: _motion(model, joint, position) for joint, position in positions.items()}
-    geared = {joint for tie in robot.ties for joint in (tie.leader, tie.follower) if is_unbounded(model, joint)}
-    kinds = {joint: pin.JointModelRevoluteUnaligned(joint_axis(model, joint)[1]) for joint in geared - set(held)}
-    if held or kinds:
-        robot = robot.rebuilt(held=held, kinds=kinds)
+    if held:
+        robot = robot.rebuilt(held=held)
     now = {model.names[joint]: float(at[0]) if at.size == 1 else tuple(at.tolist()) for joint, at in positions.items()}
     loops = tuple((a, b) for a, b in robot.loops if _carriers(robot, a).isdisjoint(_carriers(robot, b)))
     robot = robot.changed(locked=MappingProxyType({**robot.locked, **now}), loops=loops)
@@ -269,7 +265,7 @@ def _motion(model: pin.Model, joint: int, position: Floats) -> pin.SE3:
 
 def _carriers(robot: Robot, name: str) -> set[int]:
     """The joints that carry the frames of a name; a loop on one joint alone is closed for good."""
-    frames = robot.free_model.frames
+    frames = robot.model.frames
     return {frame.parentJoint for frame in frames if frame.name == name and frame.type != pin.FrameType.JOINT}
 
 

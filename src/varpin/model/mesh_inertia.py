@@ -38,7 +38,7 @@ def with_mesh_inertias(robot: Robot, density: float) -> Robot:
     for link, fault in faults.items():
         if link not in known:
             raise RobotError(fault)
-    model, index = robot.free_model.copy(), joint_index(robot.free_model)
+    model, index = robot.model.copy(), joint_index(robot.model)
     masses: dict[str, float] = {}
     for shape in shapes.geometryObjects:
         link = urdf.model.frames[shape.parentFrame].name
@@ -57,4 +57,4 @@ def with_mesh_inertias(robot: Robot, density: float) -> Robot:
         masses[link] = masses.get(link, 0.0) + density * volume
     weighed = listed((f"{link!r} {mass:.3g} kg" for link, mass in masses.items()), "links")
     remark = f"links without an inertia have that of their shapes at {density:g} kg/m^3: {weighed}"
-    return robot.changed(free_model=model, remarks=(*robot.remarks, remark)) if masses else robot
+    return robot.changed(model=model, remarks=(*robot.remarks, remark)) if masses else robot

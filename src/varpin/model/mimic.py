@@ -1,8 +1,4 @@
-"""Mimic joints: leaders and followers, and Pinocchio models with and without the ties between them.
-
-Pinocchio computes no RNEA derivatives of a model with mimic joints. varpin therefore keeps two models: one in which
-followers are tied to their leaders, and a free one in which every joint is independent.
-"""
+"""Mimic joints, leaders and followers, which are independent in Pinocchio's model; and models rebuilt."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -75,54 +71,15 @@ def _to_free_leader(tie: Tie, ties: dict[int, Tie], model: pin.Model) -> Tie:
     raise RobotError(f"joint {model.names[tie.follower]!r} mimics itself through a loop of mimic joints")
 
 
-def tied_model(model: pin.Model, ties: Sequence[Tie]) -> pin.Model:
-    """``model`` with its followers as Pinocchio mimic joints."""
-    for tie in ties:
-        model = pin.transformJointIntoMimic(model, tie.leader, tie.follower, tie.ratio, tie.offset)
-    return model
-
-
-def depth_first(model: pin.Model, ties: Sequence[Tie]) -> list[int]:
-    """An order of the joints that Pinocchio's algorithms accept: subtrees contiguous, leaders before followers.
-
-    The given order is kept where it qualifies.
-    """
-    parents = list(model.parents)
-
-    def ancestors(joint: int) -> list[int]:
-        path = [joint]
-        while path[-1] > 0:
-            path.append(parents[path[-1]])
-        return path
-
-    before: dict[int, set[int]] = {}
-    for tie in ties:
-        leaders, followers = ancestors(tie.leader), ancestors(tie.follower)
-        if tie.follower in leaders:
-            raise RobotError(
-                f"joint {model.names[tie.follower]!r} carries the joint it mimics, {model.names[tie.leader]!r}: "
-                "Pinocchio cannot tie them; load with mimic='free' and lock one of them"
-            )
-        if tie.leader in followers:
-            continue
-        fork = next(joint for joint in leaders if joint in followers)
-        first, then = leaders[leaders.index(fork) - 1], followers[followers.index(fork) - 1]
-        before.setdefault(then, set()).add(first)
-
-    children: list[list[int]] = [[] for _ in parents]
-    for joint in range(1, model.njoints):
-        children[parents[joint]].append(joint)
+def depth_first(model: pin.Model) -> list[int]:
+    """The joints, subtree by subtree, as Pinocchio's algorithms need them."""
+    children: list[list[int]] = [[] for _ in model.parents]
+    for joint in range(model.njoints - 1, 0, -1):
+        children[model.parents[joint]].append(joint)
     order, stack = [], [0]
     while stack:
         order.append(joint := stack.pop())
-        waiting, visits = children[joint], []
-        while waiting:
-            ready = [child for child in waiting if not before.get(child, set()) & set(waiting)]
-            if not ready:
-                raise RobotError(f"mimic joints below {model.names[joint]!r} follow each other across branches")
-            waiting.remove(ready[0])
-            visits.append(ready[0])
-        stack.extend(reversed(visits))
+        stack += children[joint]
     return order[1:]
 
 

@@ -41,7 +41,7 @@ def frame_names(option: str, robots: Sequence[Robot], names: bool | str | Sequen
     for name in wanted:
         if not isinstance(name, str):
             raise InputError(f"{option} must be names of frames, got {name!r}")
-        if not any(robot.free_model.existFrame(name) for robot in robots):
-            known = dict.fromkeys(frame.name for robot in robots for frame in robot.free_model.frames)
+        if not any(robot.model.existFrame(name) for robot in robots):
+            known = dict.fromkeys(frame.name for robot in robots for frame in robot.model.frames)
             raise UnknownFrame(name, known, *(robot.name for robot in robots), option=option)
-    return [tuple(name for name in wanted if robot.free_model.existFrame(name)) for robot in robots]
+    return [tuple(name for name in wanted if robot.model.existFrame(name)) for robot in robots]

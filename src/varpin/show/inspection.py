@@ -311,7 +311,7 @@ def _condition_number(M: Floats) -> float:
 
 
 def _joints(robot: Robot) -> tuple[JointReport, ...]:
-    model = robot.free_model
+    model = robot.model
     ties = {tie.follower: tie for tie in robot.ties}
     reports = []
     for joint in range(1, model.njoints):
@@ -328,7 +328,7 @@ def _joints(robot: Robot) -> tuple[JointReport, ...]:
 
 def _links(robot: Robot) -> tuple[LinkReport, ...]:
     # The links of the URDF: Pinocchio merges links on fixed joints into one body, which can hide a faulty inertia.
-    model = robot.free_model
+    model = robot.model
     joints = joint_index(model)
     joints |= {frame.name: frame.parentJoint for frame in model.frames if frame.type == pin.FrameType.BODY}
     return tuple(
@@ -352,7 +352,7 @@ _KINDS: dict[pin.FrameType, FrameKind] = {
 
 
 def _frames(robot: Robot) -> tuple[FrameReport, ...]:
-    model, reports = robot.free_model, {}
+    model, reports = robot.model, {}
     for index, frame in enumerate(model.frames):
         # The first frame is the world. Of several frames with the same name, varpin finds the first.
         if index == 0 or frame.name in reports:
@@ -366,9 +366,9 @@ def _frames(robot: Robot) -> tuple[FrameReport, ...]:
 
 
 def _mass_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
-    tree, names = robot.tree, [part.link for part in inertials_of(robot.free_model)]
+    tree, names = robot.tree, [part.link for part in inertials_of(robot.model)]
     for body, mass in enumerate(tree.mass):
-        name, joint = names[body], robot.free_model.names[body + 1]
+        name, joint = names[body], robot.model.names[body + 1]
         if mass == 0.0:
             carries = "only the links that it carries give the joint inertia"
             if body not in tree.parent:
@@ -387,7 +387,7 @@ def _inertia_warnings(
     around: dict[int, list[Floats]] = {}
     for shape in shapes.geometryObjects:
         around.setdefault(shape.parentJoint, []).append(shape_points(shape))
-    frames = {frame.name: frame for frame in robot.free_model.frames if frame.type == pin.FrameType.BODY}
+    frames = {frame.name: frame for frame in robot.model.frames if frame.type == pin.FrameType.BODY}
     for link in links:
         if not link.joint:
             continue
@@ -428,7 +428,7 @@ def _mesh_warnings(robot: Robot, shapes: pin.GeometryModel) -> Iterator[str]:
         return
     shape, size = max(sizes.items(), key=lambda own: own[1])
     if not MESH_RATIOS[0] * reach <= size <= MESH_RATIOS[1] * reach:
-        name, link = Path(shape.meshPath).name or shape.name, robot.free_model.frames[shape.parentFrame].name
+        name, link = Path(shape.meshPath).name or shape.name, robot.model.frames[shape.parentFrame].name
         yield (
             f"mesh {name!r} of link {link!r} is {size:.3g} m long, where the arm reaches {reach:.3g} m: if it is not "
             "in metres, its scale= must make it so"

@@ -198,7 +198,7 @@ class Triad:
 
     def _placement(self, figure: Figure) -> tuple[int, Floats, Floats]:
         robot = figure.picture.robot
-        return place_of_frame(robot.free_model, self.name, robot.name)
+        return place_of_frame(robot.model, self.name, robot.name)
 
 
 @dataclass(frozen=True, eq=False)
