@@ -151,7 +151,9 @@ def test_largest_step_of_a_pendulum_standing_up_and_hanging_down(tmp_path):
 
 def test_loaded_robot_is_taken_and_not_loaded_otherwise():
     robot = vp.planar_chain(2)
-    assert inspect_robot(robot).robot is robot
+    assert inspect_robot(robot).robot is inspect_robot(robot, lock=None).robot is robot
+    with pytest.raises(TypeError, match="unexpected keyword argument 'lokc'"):
+        inspect_robot("ur5", lokc={})
     with refused(vp.InputError, "lock"):
         inspect_robot(robot, lock={"joint1": 0.0})
 

@@ -389,20 +389,21 @@ class TestMimic:
         path = write_urdf(
             tmp_path,
             *(link(name) for name in ("a", "b", "c", "d")),
-            joint("j_a", "base", "a", inside=mimic("j_d", -0.5, 0.1)),
+            joint("j_a", "base", "a", inside=mimic("j_d", -2.0, 0.1)),
             joint("j_b", "a", "b"),
             joint("j_c", "base", "c"),
             joint("j_d", "c", "d"),
         )
         robot = vp.load_robot(path)
         assert robot.joint_names == ("j_b", "j_c", "j_d")
-        place = {"j_c": (0.2, 1.0), "j_d": (0.4, 2.0), "j_b": (0.6, 3.0), "j_a": (-0.1, -1.0)}
+        place = {"j_c": (0.2, 1.0), "j_d": (0.4, 2.0), "j_b": (0.6, 3.0), "j_a": (-0.7, -4.0)}
         self.check(robot, [0.6, 0.2, 0.4], [3.0, 1.0, 2.0], place)
-        assert robot.velocity_limit.tolist() == [8.0] * 3
-        assert robot.effort_limit.tolist() == [9.0, 9.0, 4.5]  # j_a bears 9 N m, twice what j_d exerts on it
+        assert robot.velocity_limit.tolist() == [8.0, 8.0, 4.0]
+        assert robot.position_limits[0] == pytest.approx([-1.0, -1.0, -0.45])
+        assert robot.position_limits[1] == pytest.approx([1.0, 1.0, 0.55])
         locked = vp.load_robot(path, lock={"j_b": 0.6})
         assert_same_jet(jet_at(locked, [0.2, 0.4], [1.0, 2.0]), jet_at(robot, [0.6, 0.2, 0.4], [0.0, 1.0, 2.0]), [1, 2])
-        assert locked.velocity_limit.tolist() == [8.0] * 2
+        assert locked.velocity_limit.tolist() == [8.0, 4.0]
 
     @pytest.mark.parametrize(
         ("ratio", "offset", "limits", "speed", "effort"),

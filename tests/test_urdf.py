@@ -422,6 +422,22 @@ class TestMany:
         assert "still here" in capfd.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("text", "facts"),
+    [("", "empty"), ("<html><body/></html>", "<html>"), ("<sdf version='1.7'/>", "<sdf>"), ("{}", "XML")],
+)
+def test_files_that_are_no_urdf(tmp_path, text, facts):
+    with refused(vp.RobotError, "odd.urdf", facts):
+        vp.load_robot(written(tmp_path, text))
+
+
+def test_a_model_whose_joints_have_no_parents_is_refused():
+    model = vp.planar_chain(3).model.copy()
+    model.parents[3] = 9
+    with refused(vp.RobotError, "'chain3'", "damaged"):
+        vp.load_robot(model)
+
+
 @pytest.mark.parametrize(("part", "facts"), [("armature", ("1", "3")), ("lowerPositionLimit", ("1", "3"))])
 def test_models_whose_parts_do_not_fit_are_refused(part, facts):
     model = vp.planar_chain(3).model.copy()

@@ -743,6 +743,8 @@ def given_constraints(
     """The constraints from the argument of a scene, with those of the robot's description in place of ``"robot"``."""
     parts: Any = ("robot",) if is_one_of(given, ("robot",)) else () if given is None else given
     if asked := isinstance(parts, list | tuple) and any(is_one_of(part, ("robot",)) for part in parts):
+        if [is_one_of(part, ("robot",)) for part in parts].count(True) > 1:
+            raise InputError("constraints has 'robot' twice")
         own = description_constraints(robot)
         parts = [each for part in parts for each in (own if is_one_of(part, ("robot",)) else (part,))]
     found = constraints_of(parts)

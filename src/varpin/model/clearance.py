@@ -393,7 +393,7 @@ def _disabled(robot: Robot, srdf: Path | None) -> set[frozenset[str]]:
     """Pairs of links that an SRDF file excludes from collision checks."""
     if srdf is None:
         return set()
-    root = read_xml(srdf)
+    root = read_xml(srdf, kind="SRDF")
     pairs = {frozenset((e.get("link1", ""), e.get("link2", ""))) for e in root.findall("disable_collisions")}
     links = {link for pair in pairs for link in pair}
     if links.isdisjoint(frame.name for frame in robot.model.frames):

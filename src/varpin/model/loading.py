@@ -6,7 +6,7 @@ import logging
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -104,11 +104,7 @@ def load_robot(
         InputError: A xacro file has no argument of that name, or a base or an armature is invalid.
         SingularMassMatrix: A joint moves no inertia, or a negative one.
     """
-    word("inertia", inertia, ("file", "meshes"))
-    whole = describe(source, package_dirs, mimic=mimic, xacro_args=xacro_args, srdf=srdf)
-    if inertia == "meshes":
-        whole = with_mesh_inertias(whole, density)
-    robot = assemble(whole, lock=lock, keep=keep, payload=payload, base=base, armature=armature)
+    robot = unchecked_robot(**locals())
     for note in robot.notes:
         logger.info("robot %r: %s", robot.name, note)
     wrong = (*robot.faults, *faults(robot.model, robot.inertials))
@@ -118,16 +114,23 @@ def load_robot(
     return robot
 
 
-def assemble(
-    robot: Robot,
+def unchecked_robot(
+    source: object,
     *,
-    lock: Mapping[str, ArrayLike] | None = None,
-    keep: Sequence[str] | None = None,
-    payload: Payload | Sequence[Payload] = (),
-    base: Base = None,
-    armature: JointValues | None = None,
+    payload: Payload | Sequence[Payload],
+    lock: Mapping[str, ArrayLike] | None,
+    keep: Sequence[str] | None,
+    base: Base,
+    armature: JointValues | None,
+    inertia: str,
+    density: float,
+    **reading: Any,
 ) -> Robot:
-    """A robot as its source describes it, with the options of :func:`load_robot`; its inertia is not checked."""
+    """The robot of :func:`load_robot`, whose arguments these are, before its inertia is checked."""
+    word("inertia", inertia, ("file", "meshes"))
+    robot = describe(source, **reading)
+    if inertia == "meshes":
+        robot = with_mesh_inertias(robot, density)
     robot = _on_base(robot, base)
     carry(robot.model, (payload,) if isinstance(payload, Payload) else payload, robot.name)
     names = list(robot.model.names)

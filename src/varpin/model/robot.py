@@ -231,61 +231,60 @@ class Robot(Frozen):
         lower, upper = self.position_limits
         return ~self.slides & np.isinf(lower) & np.isinf(upper)
 
-    @cached_property
+    @property
     def position_limits(self) -> tuple[Floats, Floats]:
         """Lower and upper bounds (n,), (n,) [rad or m]; infinite where there are none.
 
         Two bounds of 0 count as none, since a URDF without limits is read so; to hold a joint still, lock it. A leader
         keeps within the limits of the mimic joints that follow it, unless they leave it no room.
         """
-        return self._position_limits[:2]
+        lower, upper, _, _ = self._limits[0]
+        return lower, upper
 
-    @cached_property
-    def _position_limits(self) -> tuple[Floats, Floats, tuple[str, ...]]:
-        """:attr:`position_limits`, and the followers whose limits would leave their leader no room."""
-        lower, upper = np.full(self.dof, -np.inf), np.full(self.dof, np.inf)
-        tree, model, left_out = self.tree, self.model, []
-        followers = {tie.follower for tie in self.ties}
-        for body in range(model.njoints - 1):
-            low, high = limits_of(model, body + 1)[:2]
-            c, ratio = int(tree.coordinate[body]), float(tree.ratio[body])
-            if body + 1 in followers:
-                if ratio == 0.0:
-                    continue
-                low, high = (
-                    (limit - tree.offset[body]) / ratio for limit in ((low, high) if ratio > 0.0 else (high, low))
-                )
-                low, high = max(low, lower[c]), min(high, upper[c])
-                if not low < high:
-                    left_out.append(model.names[body + 1])
-                    continue
-            lower[c], upper[c] = low, high
-        for limit in (lower, upper):
-            limit.setflags(write=False)
-        return lower, upper, tuple(left_out)
-
-    @cached_property
+    @property
     def velocity_limit(self) -> Floats:
         """Bound (n,) [rad/s or m/s]; infinite where there is none, or one of 0.
 
         The bound of a mimic joint is one of its leader.
         """
-        return self._limit(2, -1)
+        return self._limits[0][2]
 
-    @cached_property
+    @property
     def effort_limit(self) -> Floats:
         """Bound (n,) [N m or N]; infinite where there is none, or one of 0.
 
         The bound of a mimic joint is one of its leader: what the leader exerts, the follower has to bear.
         """
-        return self._limit(3, 1)
+        return self._limits[0][3]
+
+    @cached_property
+    def _limits(self) -> tuple[tuple[Floats, Floats, Floats, Floats], tuple[str, ...]]:
+        """All limits of the coordinates, and the followers whose limits would leave their leader no room."""
+        lower, velocity, left_out = np.full(self.dof, -np.inf), np.full(self.dof, np.inf), []
+        upper, effort, tree = velocity.copy(), velocity.copy(), self.tree
+        for joint in (*self._coordinates, *(tie.follower for tie in self.ties)):
+            c, ratio, offset = (values[joint - 1] for values in (tree.coordinate, tree.ratio, tree.offset))
+            if ratio == 0.0:
+                continue
+            low, high, speed, force = limits_of(self.model, joint)
+            velocity[c], effort[c] = min(velocity[c], speed / abs(ratio)), min(effort[c], force * abs(ratio))
+            low, high = ((limit - offset) / ratio for limit in ((low, high) if ratio > 0.0 else (high, low)))
+            low, high = max(low, lower[c]), min(high, upper[c])
+            if joint in self._coordinates or low < high:
+                lower[c], upper[c] = low, high
+            else:
+                left_out.append(self.model.names[joint])
+        limits = lower, upper, velocity, effort
+        for limit in limits:
+            limit.setflags(write=False)
+        return limits, tuple(left_out)
 
     def limit_remarks(self) -> Iterator[str]:
         """What is odd about limits, one sentence a kind."""
         bounds = zip(self.joint_names, *self.position_limits, strict=True)
         if tight := [f"{low:g} and {high:g} of {name!r}" for name, low, high in bounds if not low < high]:
             yield f"limits leave no room to move (lock= holds a joint): {listed(tight, 'joints')}"
-        if names := self._position_limits[2]:
+        if names := self._limits[1]:
             joints = listed(map(repr, names), "mimic joints")
             yield f"limits that leave the joint that a mimic joint follows no room are left out: those of {joints}"
 
@@ -324,15 +323,6 @@ class Robot(Frozen):
         """Weighted sums (n,) over the joints of ``model`` that each coordinate moves."""
         sums = np.bincount(self.tree.coordinate, np.asarray(values, dtype=float) * weights, minlength=self.dof)
         return np.asarray(sums, dtype=np.float64)
-
-    def _limit(self, which: int, power: int) -> Floats:
-        """The least limit (n,) of the joints that each coordinate moves, times their ratios to a power."""
-        limit = np.full(self.dof, np.inf)
-        for body, (c, ratio) in enumerate(zip(self.tree.coordinate, np.abs(self.tree.ratio), strict=True)):
-            if ratio > 0.0:
-                limit[c] = min(limit[c], limits_of(self.model, body + 1)[which] * ratio**power)
-        limit.setflags(write=False)
-        return limit
 
 
 def limits_of(model: pin.Model, joint: int) -> tuple[float, float, float, float]:

@@ -54,11 +54,11 @@ def robot_names() -> tuple[str, ...]:
 
 def describe(
     source: object,
-    package_dirs: Sequence[str | os.PathLike[str]] | None = None,
     *,
-    mimic: Literal["tied", "free"] = "tied",
-    xacro_args: Mapping[str, object] | None = None,
-    srdf: str | os.PathLike[str] | None = None,
+    package_dirs: Sequence[str | os.PathLike[str]] | None,
+    mimic: Literal["tied", "free"],
+    xacro_args: Mapping[str, object] | None,
+    srdf: str | os.PathLike[str] | None,
 ) -> Robot:
     """Find and parse ``source``; see :func:`varpin.load_robot`.
 
@@ -76,10 +76,14 @@ def describe(
         srdf=path or files.srdf,
         srdf_args={**(files.srdf_args if path is None else {}), **arguments},
     )
-    if isinstance(source, pin.Model):
-        robot = _of_model(source, source.name or "model", None)
-    elif isinstance(source, pin.RobotWrapper):
-        robot = _of_model(source.model, source.model.name or "robot", source.visual_model)
+    if isinstance(source, pin.Model | pin.RobotWrapper):
+        model, shapes = (source, None) if isinstance(source, pin.Model) else (source.model, source.visual_model)
+        try:
+            robot = _of_model(model, model.name or "model", shapes)
+        except RobotError:
+            raise
+        except (IndexError, ValueError, RuntimeError) as error:
+            raise RobotError(f"model {model.name!r} is damaged: {error}") from None
     elif files.name:
         robot = _of_files(files, tied=mimic == "tied")
     else:

@@ -46,9 +46,7 @@ def read_srdf(path: Path, text: str | None = None) -> tuple[tuple[Posture, ...],
     Returns:
         Its postures, and the armature of joints by name [kg m^2 or kg]: rotor inertia times squared gear ratio.
     """
-    root = read_xml(path, text)
-    if root.tag != "robot":
-        raise RobotError(f"{path} is not an SRDF: its root element is <{root.tag}>, not <robot>")
+    root = read_xml(path, text, "SRDF")
     postures, armature = [], {}
     for state in root.findall("group_state"):
         name, positions = state.get("name", ""), []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from inspect import signature
 from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
@@ -20,11 +21,10 @@ from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot, check_inertia, longest_reach, readable_geometry
 from varpin.model.inertia import fault, inertials_of, one_of_each, principal_moments
-from varpin.model.loading import assemble
+from varpin.model.loading import load_robot, unchecked_robot
 from varpin.model.meshes import shape_points
 from varpin.model.mimic import joint_index
 from varpin.model.robot import limits_of
-from varpin.model.sources import describe
 from varpin.model.tree import is_unbounded, joint_axis
 from varpin.model.urdf import listed
 from varpin.support import markup
@@ -51,8 +51,6 @@ SIZE_RATIO = 1.5
 MESH_RATIOS = (0.01, 10.0)
 # Density of osmium, the densest element [kg/m^3].
 DENSITY = 22_600.0
-# Options of :func:`varpin.load_robot` that say how a file is read; the others change the robot.
-_READING = frozenset({"package_dirs", "mimic", "xacro_args", "srdf"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,12 +258,13 @@ def inspect_robot(
             robot.
     """
     if isinstance(source, Robot):
-        if loading:
-            raise InputError(f"{', '.join(loading)}: options of loading, and the robot is already loaded")
+        if given := [name for name, value in loading.items() if value is not None]:
+            raise InputError(f"{', '.join(given)}: options of loading, and the robot is already loaded")
         robot = source
     else:
-        whole = describe(source, **{name: loading.pop(name) for name in _READING & loading.keys()})
-        robot = assemble(whole, **loading)
+        options = signature(load_robot).bind(source, **loading)
+        options.apply_defaults()
+        robot = unchecked_robot(**options.arguments)
     scene = Scene(robot, gravity=gravity, damping=0.0, constraints=())
     configuration = joint_array("q", 0.0 if q is None else q, robot.joint_names, uniform=True)
     velocity = joint_array("v", 0.0 if v is None else v, robot.joint_names, uniform=True)
