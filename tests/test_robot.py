@@ -17,26 +17,6 @@ from varpin.model import example_robot_data, geometry
 MOVING = ("revolute", "continuous", "prismatic")
 
 
-def mimics_of(urdf: Path) -> dict[str, tuple[str, float, float]]:
-    """Follower: (leader, ratio, offset), for leaders that move."""
-    joints = {j.get("name"): j for j in ET.parse(urdf).getroot().findall("joint") if j.get("type") in MOVING}
-    found = {}
-    for name, element in joints.items():
-        tie = element.find("mimic")
-        if tie is not None and tie.get("joint") in joints:
-            found[name] = (tie.get("joint"), float(tie.get("multiplier", 1)), float(tie.get("offset", 0)))
-    return found
-
-
-def tie_matrix(model: pin.Model, names: tuple[str, ...], mimics: dict[str, tuple[str, float, float]]):
-    """G (nv, n) and g (nv,): joint positions of ``model`` are G q + g. Leaders are no followers here."""
-    G, g = np.zeros((model.nv, len(names))), np.zeros(model.nv)
-    for k, name in enumerate(list(model.names)[1:]):
-        leader, ratio, offset = mimics.get(name, (name, 1.0, 0.0))
-        G[k, names.index(leader)], g[k] = ratio, offset
-    return G, g
-
-
 def configuration(model: pin.Model, positions: np.ndarray) -> np.ndarray:
     q = pin.neutral(model)
     for k in range(model.njoints - 1):
@@ -62,23 +42,6 @@ def assert_same_jet(a: vp.LagrangianJet, b: vp.LagrangianJet, keep=slice(None), 
         whole = getattr(b, name)
         part = whole[keep] if whole.ndim == 1 else whole[keep][:, keep]
         np.testing.assert_allclose(getattr(a, name), part, rtol=0, atol=rtol * np.abs(whole).max(), err_msg=name)
-
-
-class TestEveryRobot:
-    def test_tied_mass_matrix_and_gravity_are_projections_of_the_free_ones(self, robot):
-        model = pin.buildModelFromUrdf(str(robot.urdf))
-        armature = {name: a for name, a in zip(robot.joint_names, robot.tree.armature, strict=True) if a}
-        model.armature = np.array([armature.get(name, 0.0) for name in list(model.names)[1:]])
-        G, g = tie_matrix(model, robot.joint_names, mimics_of(robot.urdf))
-        rng = np.random.default_rng(7)
-        for q in rng.uniform(-2.0, 2.0, (3, robot.dof)):
-            full_q = configuration(model, G @ q + g)
-            jet = vp.lagrangian_jet(vp.Scene(robot), q, np.zeros(robot.dof))
-            expected = G.T @ full_crba(model, full_q) @ G
-            np.testing.assert_allclose(jet.Lvv, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-            weight = G.T @ pin.computeGeneralizedGravity(model, model.createData(), full_q)
-            scale = np.abs(G).T @ np.abs(pin.computeGeneralizedGravity(model, model.createData(), full_q))
-            np.testing.assert_allclose(-jet.Lq, weight, rtol=0, atol=1e-12 * max(scale.max(), 1e-3))
 
 
 def test_only_the_bravo7_is_not_installed():
