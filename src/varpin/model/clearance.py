@@ -163,17 +163,11 @@ class Obstacle(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class _Body:
-    """A body in the world or on a link.
+    """A body in the world or on a link."""
 
-    Attributes:
-        solid: The obstacle; or the link's capsule in its own axes, with the link's name.
-        kinematics: Kinematics of the link; None in the world.
-        shifts: Displacements of the obstacle at the times in question (K, 3) [m].
-    """
-
-    solid: Obstacle
-    kinematics: FrameKinematics | None = None
-    shifts: Floats = field(default_factory=lambda: np.zeros((1, 3)))
+    solid: Obstacle  # or the link's capsule in its own axes, with the link's name
+    kinematics: FrameKinematics | None = None  # of the link; None in the world
+    shifts: Floats = field(default_factory=lambda: np.zeros((1, 3)))  # of the obstacle at the times (K, 3) [m]
 
 
 class Clearance(Frozen):
@@ -248,11 +242,7 @@ _Placed = tuple[Floats, Floats, Floats]
 
 
 def _round(one: Obstacle, other: Obstacle, here: _Placed, there: _Placed) -> tuple[Floats, Floats, Floats, Floats]:
-    """Distances of two capsules: that of their axes less both radii (Ericson, "Real-time collision detection", 5.1.9).
-
-    Returns:
-        What :meth:`Clearance._measured` returns, for one pair.
-    """
+    """:meth:`Clearance._measured` of one pair of capsules (Ericson, "Real-time collision detection", 5.1.9)."""
     p1, p2 = here[0], there[0]
     d1, d2, r = here[1] - p1, there[1] - p2, p1 - p2
     a, e, b = ((x * y).sum(axis=1) for x, y in ((d1, d1), (d2, d2), (d1, d2)))

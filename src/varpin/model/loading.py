@@ -18,7 +18,7 @@ from varpin.model.inertia import faults
 from varpin.model.mesh_inertia import with_mesh_inertias
 from varpin.model.mimic import joint_index
 from varpin.model.payload import Payload, carry
-from varpin.model.robot import Robot, check_inertia
+from varpin.model.robot import Robot, check_inertia, limits_of
 from varpin.model.sources import describe
 from varpin.model.tree import is_unbounded, joint_axis
 from varpin.model.units import ADVICE, looks_like_degrees
@@ -212,13 +212,10 @@ def _locks(robot: Robot, lock: Mapping[str, ArrayLike] | None, keep: Sequence[st
         if joint == 0 or name in (*keep, *PLANAR) or name in leaders or name in given:
             continue
         kind = model.joints[joint]
-        at = slice(kind.idx_q, kind.idx_q + kind.nq)
         if kind.nv > 1:
-            given[name] = neutral[at]
-        elif kind.nq == 2:
-            given[name] = 0.0
+            given[name] = neutral[kind.idx_q : kind.idx_q + kind.nq]
         else:
-            low, high = float(model.lowerPositionLimit[at][0]), float(model.upperPositionLimit[at][0])
+            low, high, *_ = limits_of(model, joint)
             given[name] = min(max(0.0, low), high) if low < high else 0.0
     return given
 
@@ -279,8 +276,8 @@ def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
     if position.shape != (size,):
         raise InputError(f"{name} must have {size} value(s), got shape {position.shape}")
     require_finite(name, position)
-    if kind.nv == 1 and kind.nq == 1:
-        low, high = (float(limits[kind.idx_q]) for limits in (model.lowerPositionLimit, model.upperPositionLimit))
+    if kind.nv == 1:
+        low, high, *_ = limits_of(model, joint)
         if low < high and not low - _OUTSIDE <= position[0] <= high + _OUTSIDE:
             units = not joint_axis(model, joint)[0] and looks_like_degrees(position[0])
             hint = f", and looks like degrees: {ADVICE}" if units else ""

@@ -115,21 +115,13 @@ def joint_frames(model: pin.Model) -> dict[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class Rebuilt:
-    """A model rebuilt from another one, by :func:`rebuild`.
-
-    Attributes:
-        model: The new model.
-        joints: The joint of the new model that carries the bodies of each old joint.
-        places: The placement of each old joint in that one.
-        frames: The index in the new model of each old frame.
-        held: The old joints that are no joints of the new one.
-    """
+    """A model rebuilt from another one, by :func:`rebuild`."""
 
     model: pin.Model
-    joints: Mapping[int, int]
-    places: Mapping[int, pin.SE3]
-    frames: Mapping[int, int]
-    held: Collection[int]
+    joints: Mapping[int, int]  # the joint of the new model that carries the bodies of each old joint
+    places: Mapping[int, pin.SE3]  # of each old joint in that one
+    frames: Mapping[int, int]  # the index in the new model of each old frame
+    held: Collection[int]  # the old joints that are no joints of the new one
 
     def ties(self, ties: Sequence[Tie]) -> tuple[Tie, ...]:
         """Those of the ties whose joints are still there."""
@@ -154,28 +146,15 @@ class Rebuilt:
 def rebuild(
     model: pin.Model,
     *,
-    order: Sequence[int] = (),
-    kinds: Mapping[int, pin.JointModel] | None = None,
-    held: Mapping[int, pin.SE3] | None = None,
-    root: Sequence[tuple[str, pin.JointModel]] = (),
-    place: pin.SE3 | None = None,
-    onto: pin.Model | None = None,
-    prefix: str = "",
+    order: Sequence[int] = (),  # of its joints, without the universe; as they are if left out
+    kinds: Mapping[int, pin.JointModel] | None = None,  # joints of another kind
+    held: Mapping[int, pin.SE3] | None = None,  # joints to fix, and their motion there
+    root: Sequence[tuple[str, pin.JointModel]] = (),  # joints in series between the universe and the root joints
+    place: pin.SE3 | None = None,  # of the model's universe; the identity if left out
+    onto: pin.Model | None = None,  # a model to append to, after its joints; a new one if left out
+    prefix: str = "",  # of the names of joints and frames
 ) -> Rebuilt:
-    """Rebuild a model with other joints, or elsewhere. Links, frames, limits and armature are kept.
-
-    Every joint of the new model has a frame.
-
-    Args:
-        model: The model.
-        order: Its joints in their new order, without the universe; as they are if left out.
-        kinds: Joints of another kind.
-        held: Joints to fix, and their motion there.
-        root: Names and kinds of joints to insert in series between the universe and the model's root joints.
-        place: Placement of the model's universe; the identity if left out.
-        onto: A model to append to, after its joints; a new one if left out.
-        prefix: Prefix of the names of joints and frames.
-    """
+    """Rebuild a model with other joints, or elsewhere. Links, frames, limits and armature are kept."""
     kinds, held, new = kinds or {}, held or {}, onto
     if new is None:
         new = pin.Model()
@@ -214,14 +193,7 @@ def rebuild(
         placement = places[joint] * frame.placement
         copied = pin.Frame(prefix + frame.name, joints[joint], up, placement, kind, pin.Inertia.Zero())
         frames[index] = new.addFrame(copied, False)
-    _repair_velocity_limits(new)
+    # Pinocchio's addJoint sets lower velocity limits to the largest double with the wrong sign.
+    lower, upper = np.array(new.lowerVelocityLimit), np.array(new.upperVelocityLimit)
+    new.lowerVelocityLimit = np.where(lower > upper, -upper, lower)
     return Rebuilt(new, joints, places, frames, held)
-
-
-def _repair_velocity_limits(model: pin.Model) -> None:
-    """Replace a lower velocity limit above the upper one by -upper.
-
-    Pinocchio's addJoint sets the lower limit to the largest double with the wrong sign.
-    """
-    lower, upper = np.array(model.lowerVelocityLimit), np.array(model.upperVelocityLimit)
-    model.lowerVelocityLimit = np.where(lower > upper, -upper, lower)
