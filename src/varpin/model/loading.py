@@ -14,10 +14,8 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError, UnknownJoint
-from varpin.model.inertia import faults
-from varpin.model.mesh_inertia import with_mesh_inertias
+from varpin.model.inertia import Payload, carry, faults, with_mesh_inertias
 from varpin.model.mimic import joint_index
-from varpin.model.payload import Payload, carry
 from varpin.model.robot import Robot, check_inertia, limits_of
 from varpin.model.sources import describe
 from varpin.model.tree import is_unbounded, joint_axis

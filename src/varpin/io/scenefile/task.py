@@ -23,7 +23,7 @@ from varpin.mechanics.reduction import Required, driving, idle_joints, report
 from varpin.mechanics.scene import Scene, closest_controls, joints_with
 from varpin.model import Robot, combine, load_robot
 from varpin.model.clearance import Obstacle
-from varpin.model.payload import Payload
+from varpin.model.inertia import Payload
 from varpin.model.tree import frame_index
 from varpin.simulation.start import on_constraints, time_steps
 from varpin.support.checks import count
