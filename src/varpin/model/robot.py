@@ -117,6 +117,11 @@ class Robot(Frozen):
         new = rebuild(self.model, **changes)
         return self.changed(model=new.model, ties=new.ties(self.ties), visuals=new.shapes(self.visuals))
 
+    @property
+    def free_model(self) -> pin.Model:
+        """:attr:`model`: in both, mimic joints are free."""
+        return self.model
+
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the joints that are coordinates, in order."""
