@@ -68,10 +68,10 @@ def slopes_in_q(function, q, step=1e-2):
 
 def masses(robot, q):
     """Centres of mass (N, 3) and their derivatives (N, 3, n), by Pinocchio."""
-    model, gear = robot.free_model, robot.free_velocities(np.eye(robot.dof)).T
+    model, gear = robot.model, robot.velocity(np.eye(robot.dof)).T
     data = model.createData()
-    slopes = np.array([pin.jacobianCenterOfMass(model, data, robot.free_positions(row)) @ gear for row in q])
-    return np.array([pin.centerOfMass(model, data, robot.free_positions(row)).copy() for row in q]), slopes
+    slopes = np.array([pin.jacobianCenterOfMass(model, data, robot.configuration(row)) @ gear for row in q])
+    return np.array([pin.centerOfMass(model, data, robot.configuration(row)).copy() for row in q]), slopes
 
 
 def terms(rng, robot, frame, q, v, u):
@@ -225,8 +225,8 @@ def tree(seed):
 
 def pinocchio_frame(robot, frame, q, v):
     """Rotation, position and twist (6,) in world axes, joint by joint in Pinocchio."""
-    model, data = robot.free_model, robot.free_model.createData()
-    pin.forwardKinematics(model, data, robot.free_positions(q), robot.free_velocities(v))
+    model, data = robot.model, robot.model.createData()
+    pin.forwardKinematics(model, data, robot.configuration(q), robot.velocity(v))
     pin.updateFramePlacements(model, data)
     index = model.getFrameId(frame)
     placed = data.oMf[index]
@@ -241,14 +241,14 @@ def test_frames(load, rng, name):
     q, v, _ = samples(rng, robot)
     kinematics = frame_kinematics(robot, frame)
     R, p, J = kinematics.jacobians(q)
-    gear = robot.free_velocities(np.eye(robot.dof)).T
-    model, data, index = robot.free_model, robot.free_model.createData(), robot.free_model.getFrameId(frame)
+    gear = robot.velocity(np.eye(robot.dof)).T
+    model, data, index = robot.model, robot.model.createData(), robot.model.getFrameId(frame)
     for k in range(N):
         rotation, position, twist = pinocchio_frame(robot, frame, q[k], v[k])
         np.testing.assert_allclose(R[k], rotation, atol=1e-13)
         np.testing.assert_allclose(p[k], position, atol=1e-13)
         np.testing.assert_allclose(J[k] @ v[k], twist, atol=1e-12)
-        whole = pin.computeFrameJacobian(model, data, robot.free_positions(q[k]), index, WORLD)
+        whole = pin.computeFrameJacobian(model, data, robot.configuration(q[k]), index, WORLD)
         np.testing.assert_allclose(J[k], whole @ gear, atol=1e-13)
     for placed, once_more in zip(kinematics.placements(q), (R, p), strict=True):
         np.testing.assert_array_equal(placed, once_more)

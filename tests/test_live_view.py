@@ -58,9 +58,9 @@ def seen(opened, browser):
 
 def stands(browser, robot, q):
     """Whether every shape on the page is where Pinocchio puts it."""
-    model, shapes = robot.free_model, geometry(robot)
+    model, shapes = robot.model, geometry(robot)
     data, placements = model.createData(), shapes.createData()
-    pin.updateGeometryPlacements(model, data, shapes, placements, robot.free_positions(np.asarray(q)))
+    pin.updateGeometryPlacements(model, data, shapes, placements, robot.configuration(np.asarray(q)))
     poses = shape_poses(browser)
     assert sorted(poses) == list(range(shapes.ngeoms))
     return all(np.allclose(poses[k], placements.oMg[k].homogeneous, atol=1e-4) for k in poses)

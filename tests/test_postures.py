@@ -120,7 +120,7 @@ BAD = {
     "no value": (SRDF.replace('value="0.5"', ""), ("'j1'", "''")),
     "infinite": (SRDF.replace('"0.5"', '"inf"'), ("'j1'", "'inf'")),
     "broken": (SRDF[:-5], ("made_up.srdf", "XML")),
-    "empty": ("", ("made_up.srdf", "XML")),
+    "empty": ("", ("made_up.srdf", "empty")),
     "another format": (SRDF.replace("robot", "sdf"), ("made_up.srdf", "<sdf>")),
 }
 

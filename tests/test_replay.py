@@ -65,12 +65,12 @@ def test_page_poses_every_shape_as_pinocchio_does(browser, tmp_path, name):
     rng = np.random.default_rng(5)
     q = rng.uniform(-1.0, 1.0, (4, robot.dof)) * np.where(robot.unbounded, 8.0, 1.0)
     visit(browser, replay(robot, q, dt=0.5, html=tmp_path / "poses.html"))
-    model, shapes = robot.free_model, geometry(robot)
+    model, shapes = robot.model, geometry(robot)
     data, placements = model.createData(), shapes.createData()
     for seconds, expected in [(0.0, q[0]), (0.75, 0.5 * (q[1] + q[2])), (1.5, q[3])]:
         seek(browser, seconds)
         poses = shape_poses(browser)
-        pin.updateGeometryPlacements(model, data, shapes, placements, robot.free_positions(expected))
+        pin.updateGeometryPlacements(model, data, shapes, placements, robot.configuration(expected))
         assert sorted(poses) == list(range(shapes.ngeoms))
         for k in range(shapes.ngeoms):
             np.testing.assert_allclose(poses[k], placements.oMg[k].homogeneous, atol=2e-5)
@@ -177,9 +177,9 @@ def test_size_stays_sane_for_a_long_motion(finger, tmp_path):
 
 def assert_ghost_at(browser, robot, q):
     """Every shape of the ghost that moves is where Pinocchio puts it."""
-    model, shapes = robot.free_model, geometry(robot)
+    model, shapes = robot.model, geometry(robot)
     data, placements = model.createData(), shapes.createData()
-    pin.updateGeometryPlacements(model, data, shapes, placements, robot.free_positions(np.asarray(q)))
+    pin.updateGeometryPlacements(model, data, shapes, placements, robot.configuration(np.asarray(q)))
     poses = shape_poses(browser, "ghost")
     assert sorted(poses) == [k for k, shape in enumerate(shapes.geometryObjects) if shape.parentJoint > 0]
     for k, pose in poses.items():

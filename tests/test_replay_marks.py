@@ -296,7 +296,7 @@ def test_links_take_the_colour_of_their_torque(browser, tmp_path):
 
 def test_robots_side_by_side_keep_their_own_motions(browser, tmp_path):
     finger = vp.load_robot("finger")
-    shapes, model, tip = geometry(finger), finger.free_model, finger.end_effector
+    shapes, model, tip = geometry(finger), finger.model, finger.end_effector
     bend = np.linspace([0.0, 0.0, 0.0], [1.0, 1.2, 1.4], 21)
     # The last one's motion is over after 0.25 s, and held.
     motions = [bend, bend[::-1], bend[:6]]
@@ -310,7 +310,7 @@ def test_robots_side_by_side_keep_their_own_motions(browser, tmp_path):
         number = f" {k + 1}" if k else ""
         shift, points = pose(browser, [f"robot{number}"])[:3, 3], []
         at, data = shapes.createData(), model.createData()
-        pin.updateGeometryPlacements(model, data, shapes, at, finger.free_positions(q))
+        pin.updateGeometryPlacements(model, data, shapes, at, finger.configuration(q))
         for index, found in shape_poses(browser, f"robot{number}").items():
             np.testing.assert_allclose(found[:3, 3], at.oMg[index].translation + shift, atol=2e-5)
             points.append(found[:3, 3])

@@ -98,7 +98,7 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
 def foreseen(problem: OptimalControlProblem) -> list[Finding]:
     """Findings about a problem before any search; where values are in wrong units, these alone."""
     goals = [*_goals(problem)]
-    units = [*in_other_units(problem.scene, problem.q0), *_in_milliseconds(problem), *_in_degrees(problem)]
+    units = [*in_other_units(problem.scene, problem.q0, problem.v0), *_in_milliseconds(problem), *_in_degrees(problem)]
     units += [*_in_millimetres(problem), *(own for own in goals if own.kind == "goal in millimetres")]
     return [*ranked(units)] or [*_starts_outside(problem), *goals, *_outside(problem), *_weights(problem)]
 

@@ -415,7 +415,7 @@ def point_of(name: str, point: Any, robot: Robot) -> tuple[int, Floats, Floats]:
             )
         return -1, np.eye(3), finite_array(name, point, (3,))
     place = finite_array(f"{name}, the place in frame {frame!r},", offset, (3,))
-    body, turned, at = place_of_frame(robot.free_model, frame, robot.name)
+    body, turned, at = place_of_frame(robot.model, frame, robot.name)
     return body, turned, at + turned @ place
 
 

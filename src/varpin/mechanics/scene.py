@@ -690,7 +690,7 @@ def require_scene(scene: object) -> Scene:
 def _gravity(gravity: ArrayLike | bool, robot: Robot) -> Floats:
     """Gravity (3,) [m/s^2] from the argument of a scene."""
     if isinstance(gravity, bool | np.bool_):
-        return finite_array("gravity of the robot", robot.free_model.gravity.linear, (3,)) if gravity else np.zeros(3)
+        return finite_array("gravity of the robot", robot.model.gravity.linear, (3,)) if gravity else np.zeros(3)
     given = as_floats("gravity", gravity)
     if given.ndim == 0 and np.isfinite(given):
         meant = f"({', '.join(f'{g:g}' for g in (0.0, 0.0, -abs(float(given))))})" if given else "False"
@@ -718,6 +718,8 @@ def given_constraints(
     """The constraints from the argument of a scene, with those of the robot's description in place of ``"robot"``."""
     parts: Any = ("robot",) if is_one_of(given, ("robot",)) else () if given is None else given
     if asked := isinstance(parts, list | tuple) and any(is_one_of(part, ("robot",)) for part in parts):
+        if [is_one_of(part, ("robot",)) for part in parts].count(True) > 1:
+            raise InputError("constraints has 'robot' twice")
         own = description_constraints(robot)
         parts = [each for part in parts for each in (own if is_one_of(part, ("robot",)) else (part,))]
     note = "; those of a plan, such as limits and obstacles, belong to varpin.OptimalControlProblem(constraints=)"

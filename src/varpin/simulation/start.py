@@ -21,9 +21,9 @@ _ROUNDING = 1e-9
 _MULTIPLE = 1e-9
 
 
-def in_other_units(scene: Scene, q0: Floats, controls: Floats | None = None) -> tuple[Finding, ...]:
-    """A warning of an initial state (n,) that looks like degrees, else of such positions in controls (N, m)."""
-    if sentence := degrees_hint(scene.robot, "q0", q0):
+def in_other_units(scene: Scene, q0: Floats, v0: Floats, controls: Floats | None = None) -> tuple[Finding, ...]:
+    """A warning of an initial state (n,), (n,) that looks like degrees, else of such positions in controls (N, m)."""
+    if sentence := degrees_hint(scene.robot, "q0", q0) or degrees_hint(scene.robot, "v0", v0, speed=True):
         return (Finding("start in degrees", sentence),)
     if controls is None or not len(controls) or not scene.holding.any():
         return ()

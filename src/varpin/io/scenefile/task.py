@@ -23,7 +23,7 @@ from varpin.mechanics.reduction import Required, driving, idle_joints, report
 from varpin.mechanics.scene import Scene, closest_controls, joints_with
 from varpin.model import Robot, combine, load_robot
 from varpin.model.clearance import Obstacle
-from varpin.model.payload import Payload
+from varpin.model.inertia import Payload
 from varpin.model.tree import frame_index
 from varpin.simulation.start import on_constraints, time_steps
 from varpin.support.checks import count
@@ -200,7 +200,7 @@ def _obstacle(where: Where, given: Any) -> Obstacle:
 
 def joints_of_frame(robot: Robot, frame: str) -> Mask:
     """Whether each coordinate (n,) moves a frame."""
-    model, moving = robot.free_model, np.zeros(robot.dof, dtype=np.bool_)
+    model, moving = robot.model, np.zeros(robot.dof, dtype=np.bool_)
     for joint in model.supports[model.frames[frame_index(model, frame, robot.name)].parentJoint]:
         if joint > 0:
             moving[robot.tree.coordinate[joint - 1]] = True
@@ -452,8 +452,8 @@ def _term(where: Where, table: Any, task: Task, horizon: tuple[float, float]) ->
     if kind in kinds.OF_JOINTS + kinds.OF_CONTROLS:
         names = task.driven if kind in kinds.OF_CONTROLS else robot.joint_names
     what = "joint" if names is not None else "component"
-    if "frame" in own and not robot.free_model.existFrame(own["frame"]):
-        where.at("frame").one_of(own["frame"], [frame.name for frame in robot.free_model.frames])
+    if "frame" in own and not robot.model.existFrame(own["frame"]):
+        where.at("frame").one_of(own["frame"], [frame.name for frame in robot.model.frames])
     axes = names if names is not None else kinds.AXES.get(kind, ("weight",))
     weight = where.at("weight").numbers(own.pop("weight", 1.0), axes, what)
     hold, terminal, given = own.pop("hold", None), own.pop("terminal", False), own.pop(target_key, None)
