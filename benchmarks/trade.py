@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CHAINS = (3, 7)
 REPEATS = 25
 WINDOWS = 200
-LEVELS = 10.0 ** -np.arange(2, 12)
+LEVELS = 10.0 ** -np.arange(2, 12, 3)
 STEPS = {
     vp.Midpoint(): (2e-2, 1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4),
     vp.RungeKutta4(): (2e-2, 1e-2, 5e-3, 2e-3, 1e-3, 5e-4),

@@ -15,7 +15,6 @@ from refusals import refused
 from test_ensemble import ARRAYS, make_scene, run, same_statistics
 
 import varpin as vp
-import varpin.ensemble
 from varpin.support.executors import executing, in_order
 
 
@@ -62,18 +61,14 @@ def same_ensembles(one, other):
 def test_processes_give_the_bytes_of_threads(pool, store):
     calls = []
     threads = run(paths=300, store=store, workers=3)
-    same_ensembles(run(paths=300, store=store, executor=pool, progress=lambda *done: calls.append(done)), threads)
+    rng = np.random.default_rng(7)
+    options = {"executor": pool, "rng": rng, "progress": lambda *done: calls.append(done)}
+    same_ensembles(run(paths=300, store=store, **options), threads)
     assert calls[-1] == (300, 300)
+    assert rng.spawn(1)[0].random() == np.random.default_rng(7).spawn(301)[300].random()
     assert len(calls) > 2
     with ThreadPoolExecutor(2) as other:
         same_ensembles(run(paths=300, store=store, executor=other), threads)
-
-
-def test_generators_go_on_as_with_threads(spawned):
-    one, other = np.random.default_rng(3), np.random.default_rng(3)
-    run(rng=one)
-    run(rng=other, executor=spawned)
-    assert one.spawn(1)[0].random() == other.spawn(1)[0].random() == np.random.default_rng(3).spawn(41)[40].random()
 
 
 def test_nothing_comes_back_that_was_not_asked_for():
@@ -180,21 +175,6 @@ def test_tasks_ahead_are_bounded_by_number_and_by_bytes(result_bytes, ahead):
     results.close()
 
 
-@pytest.mark.parametrize("options", [{"store": True}, {"quantiles": ()}, {}])
-def test_what_a_chunk_takes_is_known_beforehand(options, monkeypatch):
-    """The bytes that come back, against those that bound how many chunks are ahead."""
-    told, real = [], varpin.ensemble.run.in_order
-
-    def listening(*args, result_bytes=0):
-        told.append(result_bytes)
-        return real(*args, result_bytes=result_bytes)
-
-    monkeypatch.setattr(varpin.ensemble.run, "in_order", listening)
-    shipping = Shipping()
-    run(paths=1024, executor=shipping, **{"store": False} | options)
-    assert max(shipping.answers) == pytest.approx(max(told), abs=3000)
-
-
 def deadly(q, v):
     if q[0] > 2.0:
         os._exit(1)
@@ -212,35 +192,6 @@ def test_paths_that_were_finished_before_a_worker_was_lost_are_kept():
     motion = vp.simulate(scene, q0[7], [0.0], dt=0.01, steps=20, check=False)
     assert kept.q[7].tobytes() == motion.q.tobytes()
     assert pickle.loads(pickle.dumps(caught.value)).ensemble.q.shape == kept.q.shape
-
-
-def failing(task):
-    if task == 2:
-        raise vp.UnknownJoint("elbow", ("knee",), "a robot")
-    return task
-
-
-def test_what_work_raises_comes_back(spawned):
-    results = in_order(spawned, failing, range(5))
-    assert [next(results), next(results)] == [0, 1]
-    with refused(vp.UnknownJoint, "elbow"):
-        next(results)
-    # The pool is as good as before.
-    assert list(in_order(spawned, abs, [-1, 2])) == [1, 2]
-
-
-def test_interruption_on_processes_keeps_what_is_done(spawned):
-    def interrupt(done, paths):
-        if done > 200:
-            raise KeyboardInterrupt
-
-    with pytest.raises(vp.EnsembleInterrupted) as caught:
-        run(paths=3000, executor=spawned, progress=interrupt)
-    part = caught.value.ensemble
-    done = len(part.q)
-    assert 200 < done < 3000
-    assert part.q.tobytes() == run(paths=done).q.tobytes()
-    assert run(executor=spawned).statistics.count[0] == 40
 
 
 def test_workers_or_executor(spawned):

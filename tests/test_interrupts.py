@@ -21,7 +21,7 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has
 SLOW = """
 import hashlib, sys, time
 import varpin as vp
-import varpin.cli.outputs, varpin.cli.simulate
+import varpin.cli.outputs, varpin.cli.runs
 from varpin.cli import main
 
 begin = time.perf_counter()
@@ -45,7 +45,7 @@ def saving(self, path, write=vp.Trajectory.save):
         time.sleep(0.01)
     return write(self, path)
 
-varpin.cli.simulate.simulate = slow_simulate
+varpin.cli.runs.simulate = slow_simulate
 vp.Trajectory.save = saving
 sys.exit(main(sys.argv[1:]))
 """
@@ -124,14 +124,14 @@ def test_the_second_ends_it(tmp_path):
 
 LOADING = """
 import sys, time
-import varpin.cli.simulate
+import varpin.cli.runs
 from varpin.cli import main
 
 def loading(*_, **__):
     print("LOADING", file=sys.stderr, flush=True)
     time.sleep(60)
 
-varpin.cli.simulate.motion_of = loading
+varpin.cli.runs.motion_of = loading
 sys.exit(main(sys.argv[1:]))
 """
 

@@ -181,109 +181,35 @@ if TYPE_CHECKING:
 # The names of the block above by their modules, which are imported with the first use of a name.
 _LATE = {
     "varpin.control": (
-        "ConstraintReport",
-        "Iteration",
-        "MonteCarlo",
-        "MonteCarloInterrupted",
-        "Multipliers",
-        "OptimalControlProblem",
-        "Refined",
-        "Refinement",
-        "SearchState",
-        "Solution",
-        "Status",
-        "Verification",
-        "ViolationOnRobot",
-        "solve",
+        "ConstraintReport Iteration MonteCarlo MonteCarloInterrupted Multipliers "
+        "OptimalControlProblem Refined Refinement SearchState Solution Status "
+        "Verification ViolationOnRobot solve"
     ),
     "varpin.control.constraints": (
-        "KeepClear",
-        "KeepInBox",
-        "KeepInHalfSpace",
-        "KeepInSphere",
-        "KeepOutOfSphere",
-        "PlanConstraint",
-        "ReachFrame",
-        "WithinControlRate",
-        "WithinJointLimits",
-        "WithinVelocityLimits",
+        "KeepClear KeepInBox KeepInHalfSpace KeepInSphere KeepOutOfSphere "
+        "PlanConstraint ReachFrame WithinControlRate WithinJointLimits "
+        "WithinVelocityLimits"
     ),
     "varpin.control.costs": (
-        "BoundCost",
-        "CenterOfMassCost",
-        "ControlCost",
-        "ControlRateCost",
-        "Cost",
-        "CostError",
-        "CustomCost",
-        "Expansion",
-        "FrameOrientationCost",
-        "FramePositionCost",
-        "FrameVelocityCost",
-        "JointLimitBarrier",
-        "ManipulabilityCost",
-        "Points",
-        "Terminal",
-        "TrackingCost",
-        "VelocityCost",
-        "VelocityLimitBarrier",
+        "BoundCost CenterOfMassCost ControlCost ControlRateCost Cost CostError "
+        "CustomCost Expansion FrameOrientationCost FramePositionCost "
+        "FrameVelocityCost JointLimitBarrier ManipulabilityCost Points Terminal "
+        "TrackingCost VelocityCost VelocityLimitBarrier"
     ),
-    "varpin.control.mpc": (
-        "Mpc",
-        "MpcRun",
-        "Plant",
-    ),
-    "varpin.ensemble": (
-        "Ensemble",
-        "EnsembleInterrupted",
-        "EnsembleStatistics",
-        "PathFailure",
-        "simulate_ensemble",
-    ),
-    "varpin.io.scenefile": (
-        "SceneFile",
-        "SceneFileError",
-        "load_scene",
-    ),
-    "varpin.linearization": (
-        "Curvature",
-        "Linearization",
-        "Moments",
-        "linearize",
-        "propagate_moments",
-        "second_order",
-    ),
-    "varpin.model.clearance": ("Obstacle",),
-    "varpin.show.inspection": (
-        "FrameReport",
-        "JointReport",
-        "LinkReport",
-        "RobotReport",
-        "inspect_robot",
-    ),
-    "varpin.show.replay.live": ("LiveView",),
-    "varpin.show.replay.motion": ("replay",),
-    "varpin.study.advice": (
-        "Advice",
-        "Choice",
-        "advise",
-    ),
-    "varpin.study.extremes": ("check_robot",),
-    "varpin.study.linearization_check": (
-        "LinearizationCheck",
-        "check_linearization",
-    ),
-    "varpin.study.plans": (
-        "OptimalControlRun",
-        "OptimalControlTradeoff",
-        "optimal_control_tradeoff",
-    ),
-    "varpin.study.precision": (
-        "WorkPrecision",
-        "WorkPrecisionRun",
-        "work_precision",
-    ),
-    "varpin.study.record": ("StudyInterrupted",),
+    "varpin.control.mpc": "Mpc MpcRun Plant",
+    "varpin.ensemble": ("Ensemble EnsembleInterrupted EnsembleStatistics PathFailure simulate_ensemble"),
+    "varpin.io.scenefile": "SceneFile SceneFileError load_scene",
+    "varpin.linearization": "Curvature Linearization Moments linearize propagate_moments second_order",
+    "varpin.model.clearance": "Obstacle",
+    "varpin.show.inspection": "FrameReport JointReport LinkReport RobotReport inspect_robot",
+    "varpin.show.replay.live": "LiveView",
+    "varpin.show.replay.motion": "replay",
+    "varpin.study.advice": "Advice Choice advise",
+    "varpin.study.extremes": "check_robot",
+    "varpin.study.linearization_check": "LinearizationCheck check_linearization",
+    "varpin.study.plans": "OptimalControlRun OptimalControlTradeoff optimal_control_tradeoff",
+    "varpin.study.precision": "WorkPrecision WorkPrecisionRun work_precision",
+    "varpin.study.record": "StudyInterrupted",
 }
 
 # Submodules that a user takes from the top level.
@@ -292,7 +218,7 @@ _MODULES = {"plots": "varpin.show.plots", "wiener": "varpin.mechanics.wiener"}
 
 if not TYPE_CHECKING:
     # What a simulation has no need of is imported with its first use: all of it at once takes as long as Pinocchio.
-    _MODULE_OF = {name: module for module, names in _LATE.items() for name in names}
+    _MODULE_OF = {name: module for module, names in _LATE.items() for name in names.split()}
 
     def __getattr__(name: str) -> object:
         from importlib import import_module  # noqa: PLC0415 - no public name

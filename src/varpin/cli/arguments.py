@@ -8,54 +8,45 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.integrators import BY_NAME, Integrator, integrator_of
 from varpin.io.scenefile import SceneFile, load_scene, scenes
 from varpin.mechanics.scene import Scene
-from varpin.model import Robot, load_robot
+from varpin.model import load_robot
 from varpin.support.checks import JointValues, joint_array
 
 
 def add_robot(parser: argparse.ArgumentParser, *, scenes: bool = False) -> None:
     """Add the robot and the options with which it is loaded."""
-    parser.add_argument(
-        "robot",
-        metavar="ROBOT",
-        help="path of a URDF file, or name of a robot of varpin or of example-robot-data"
-        + ("; or a scene file (TOML), or name of a scene of varpin" if scenes else ""),
-    )
+    text = "path of a robot's file, or name of a robot" + ("; or a scene file, or name of a scene" if scenes else "")
+    parser.add_argument("robot", metavar="ROBOT", help=text)
     add_robot_options(parser)
 
 
-# Options that :func:`add_robot_options` adds.
-ROBOT_OPTIONS = ("lock", "package_dir")
+# Options that a scene file takes the place of.
+_OF_SCENES = (
+    *("lock", "package_dir", "dt", "tolerance", "duration", "steps", "integrator", "q", "v"),
+    *("q0", "v0", "gravity", "damping", "stiffness", "rest", "torque"),
+)
 
 
 def add_robot_options(parser: argparse.ArgumentParser) -> None:
     """Add the options with which the robot is loaded; a scene file has more."""
-    parser.add_argument(
-        "--lock",
-        type=_lock,
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="JOINT=VALUE",
-        help="lock joints at positions [rad or m]",
-    )
-    parser.add_argument(
-        "--package-dir",
-        action="append",
-        metavar="DIR",
-        help="folder in which package:// paths of meshes are looked up; repeatable",
-    )
+    text = "lock joints at positions [rad or m]"
+    parser.add_argument("--lock", nargs="+", action="extend", metavar="JOINT=VALUE", help=text)
+    text = "folder in which package:// paths of meshes are looked up; repeatable"
+    parser.add_argument("--package-dir", action="append", metavar="DIR", help=text)
 
 
 def robot_options(request: argparse.Namespace) -> dict[str, Any]:
     """The options of :func:`add_robot_options` as arguments of :func:`varpin.load_robot`."""
-    return {"package_dirs": request.package_dir, "lock": dict(request.lock)}
+    lock = values_of("lock", request.lock)
+    if not isinstance(lock, dict | None):
+        raise InputError(f"--lock takes JOINT=VALUE, for example elbow=0.5, got {' '.join(request.lock)}")
+    return {"package_dirs": request.package_dir, "lock": lock or {}}
 
 
 def add_motion(parser: argparse.ArgumentParser) -> None:
@@ -75,7 +66,7 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
 
 def add_vector(group: argparse._ActionsContainer, name: str, text: str) -> None:
     """Add an option: one number for all joints, one for each, some by name, or a word."""
-    group.add_argument(f"--{name}", type=_value, nargs="+", metavar="X", help=text)
+    group.add_argument(f"--{name}", nargs="+", metavar="X", help=text)
 
 
 def add_integrator(parser: argparse.ArgumentParser) -> None:
@@ -100,76 +91,43 @@ def integrator_of_words(text: str) -> Integrator:
 def add_gravity(group: argparse._ActionsContainer) -> None:
     """Add gravity as a vector, or none."""
     gravity = group.add_mutually_exclusive_group()
-    gravity.add_argument(
-        "--gravity",
-        type=float,
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        default=True,
-        help="in world axes [m/s^2]; default: the robot's, 0 0 -9.81",
-    )
+    text = "in world axes [m/s^2]; default: the robot's, 0 0 -9.81"
+    gravity.add_argument("--gravity", type=float, nargs=3, metavar=("X", "Y", "Z"), default=True, help=text)
     gravity.add_argument("--no-gravity", dest="gravity", action="store_false", help="none")
 
 
-def _lock(word: str) -> tuple[str, ArrayLike]:
-    name, equals, value = word.strip().rpartition("=")
-    try:
-        numbers = [float(part) for part in value.split(",")]
-    except ValueError:
-        numbers = []
-    if not (equals and name and numbers):
-        raise argparse.ArgumentTypeError(f"{word!r} is not of the form JOINT=VALUE, for example elbow=0.5")
-    return name, numbers[0] if len(numbers) == 1 else numbers
-
-
-def _value(word: str) -> float | tuple[str, float] | str:
-    """A number, a joint and its number, or a word, which begins with a letter."""
-    text = word.strip()
-    name, equals, value = text.rpartition("=")
-    if text[:1].isalpha() and not equals:
-        return text
-    try:
-        return (name, float(value)) if equals else float(value)
-    except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is neither a number nor of the form JOINT=VALUE, for example elbow=0.5"
-        ) from None
-
-
-def values_of(option: str, given: Sequence[float | tuple[str, float] | str] | None) -> JointValues | str | None:
-    """Value of an option of :func:`add_vector`: None, one number, several, some by name, or a word."""
-    if given is None:
+def values_of(option: str, words: Sequence[str] | None) -> JointValues | str | None:
+    """The words of an option: None, one number, several, some by name, or one word, which begins with a letter."""
+    if words is None:
         return None
-    if len({type(item) for item in given}) > 1:
-        raise InputError(f"--{option} takes numbers, or JOINT=VALUE, or one word alone; not several of these")
-    numbers: list[Any] = list(given)
-    if not isinstance(given[0], tuple):
-        return numbers[0] if len(numbers) == 1 else numbers
-    named = dict(numbers)
-    if len(named) < len(numbers):
-        raise InputError(f"--{option} names a joint more than once, among {', '.join(map(repr, named))}")
-    return named
+    if len(words) == 1 and "=" not in words[0] and words[0].strip()[:1].isalpha():
+        return words[0].strip()
+    pairs = [word.strip().rpartition("=") for word in words]
+    names = {name for name, *_ in pairs}
+    try:
+        numbers = [float(number) for *_, number in pairs]
+        if names != {""} and ("" in names or len(names) < len(numbers)):
+            raise ValueError
+    except ValueError:
+        allowed = "numbers, JOINT=VALUE once for each of some joints, or one word"
+        raise InputError(f"--{option} takes {allowed}; got {' '.join(words)}") from None
+    if names != {""}:
+        return {name: number for (name, *_), number in zip(pairs, numbers, strict=True)}
+    return numbers[0] if len(numbers) == 1 else numbers
 
 
-def _joints(option: str, request: argparse.Namespace, robot: Robot) -> Floats | str | None:
-    """The numbers (n,) of an option, or its word; None if it was not given."""
-    values = values_of(option, getattr(request, option))
-    if values is None or isinstance(values, str):
-        return values
-    return joint_array(f"--{option}", values, robot.joint_names, uniform=True)
-
-
-def motion_of(request: argparse.Namespace) -> tuple[Scene, ArrayLike, ArrayLike, NDArray[np.float64] | None]:
+def motion_of(request: argparse.Namespace) -> tuple[Scene, ArrayLike, ArrayLike, Floats | None]:
     """The scene, q0, v0, and the torque unless it is zero."""
     robot = load_robot(request.robot, **robot_options(request))
-    names = ("damping", "stiffness", "rest", "q0", "v0", "torque")
-    given: dict[str, Any] = {name: _joints(name, request, robot) for name in names}
-    q0, v0, torque = (given.pop(name) for name in ("q0", "v0", "torque"))
-    forces = {name: value for name, value in given.items() if value is not None}
-    scene = Scene(robot, gravity=request.gravity, **forces)
-    still = np.zeros(robot.dof)
-    start = robot.posture(q0) if isinstance(q0, str) else still if q0 is None else q0
-    return scene, start, still if v0 is None else v0, torque if np.any(torque) else None
+    given: dict[str, Any] = {}
+    for name in ("damping", "stiffness", "rest", "q0", "v0", "torque"):
+        values = values_of(name, getattr(request, name))
+        if isinstance(values, str):
+            given[name] = robot.posture(values) if name == "q0" else values
+        elif values is not None:
+            given[name] = joint_array(f"--{name}", values, robot.joint_names, uniform=True)
+    q0, v0, torque = (given.pop(name, np.zeros(robot.dof)) for name in ("q0", "v0", "torque"))
+    return Scene(robot, gravity=request.gravity, **given), q0, v0, torque if np.any(torque) else None
 
 
 def names_scene(word: str) -> bool:
@@ -177,12 +135,12 @@ def names_scene(word: str) -> bool:
     return Path(word).suffix == ".toml" or word in scenes()
 
 
-def scene_file(request: argparse.Namespace, word: str, *excluded: str) -> SceneFile:
-    """Load a scene file, with which the options ``excluded`` cannot be given."""
-    default = request.parser.parse_args(["robot"])
-    for name in excluded:
-        if getattr(request, name) != getattr(default, name):
-            option = name.replace("_", "-") if getattr(request, name) is not False else f"no-{name}"
+def scene_file(request: argparse.Namespace, word: str) -> SceneFile:
+    """Load a scene file, which has what other options would say."""
+    for name in _OF_SCENES:
+        given = getattr(request, name, None)
+        if given is not None and given is not True:
+            option = "no-gravity" if given is False else name.replace("_", "-")
             raise InputError(f"--{option} cannot be given with a scene file: {word} has it")
     return load_scene(word)
 

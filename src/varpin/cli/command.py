@@ -8,28 +8,22 @@ from collections.abc import Callable, Sequence
 from rich.console import Console
 
 from varpin._version import __version__
-from varpin.cli.console import Parser, complain, logged, say
-from varpin.cli.exits import INTERRUPTED, MISTAKE
-from varpin.cli.inspect import add_inspect, add_robots
+from varpin.cli.console import INTERRUPTED, MISTAKE, Parser, complain, logged, say
 from varpin.cli.interrupts import Interrupts
-from varpin.cli.replay import add_replay
-from varpin.cli.simulate import add_simulate
-from varpin.cli.solve import add_solve
+from varpin.cli.runs import add_simulate, add_solve
 from varpin.cli.studies import add_advise, add_extremes, add_tradeoff
+from varpin.cli.views import add_inspect, add_replay, add_robots
 from varpin.errors import VarpinError
 
 _EXAMPLES = """\
 examples:
   varpin simulate finger --q0 0.5 0.3 0.2 --v0 0 0 1 --no-gravity --html finger.html
   varpin simulate panda --lock panda_finger_joint1=0.02 --q0 -0.5 --duration 5 --save fall.npz --plot fall.png
-  varpin simulate arm.urdf --dt 5e-4 --steps 4000 --damping 0.1 --torque elbow=-2.5
   varpin robots
-  varpin inspect ur5 --q 0 -1.2 1 0 0 0
+  varpin inspect ur5
   varpin solve finger_tracking --html finger.html --save plan.npz
   varpin replay plan.npz --robot finger_tracking
-  varpin simulate scene.toml --plot motion.png
   varpin advise ur5 --tolerance 1e-6 --duration 1
-  varpin tradeoff ur5 --duration 1 --out ur5-tradeoff
   varpin extremes finger --out finger-extremes
 """
 
@@ -54,9 +48,7 @@ def _parser() -> Parser:
         ("advise", add_advise, "find the cheapest integrator and step"),
         ("extremes", add_extremes, "run every integrator where it is hard"),
     ):
-        command = commands.add_parser(name, help=text, allow_abbrev=False)
-        add(command)
-        command.set_defaults(parser=command)
+        add(commands.add_parser(name, help=text, allow_abbrev=False))
     return parser
 
 

@@ -7,15 +7,14 @@ import contextlib
 import logging
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from varpin.cli.exits import MISTAKE
-
+# Exit statuses other than 0.
+FAULTY, MISTAKE, STEP_FAILED, INTERRUPTED = 1, 2, 3, 130
 # Shortest time between two lines of progress where there is no terminal [s].
 INTERVAL = 10.0
 
@@ -30,16 +29,6 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the error and a hint at --help; exit with status 2."""
         self.exit(MISTAKE, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
-
-
-def written_rows(files: Iterable[Path]) -> list[tuple[str, str]]:
-    """A row of a table for each file that was written, with its size."""
-    rows = []
-    for path in files:
-        size = path.stat().st_size
-        unit, one = next(((unit, one) for unit, one in (("MB", 1e6), ("kB", 1e3)) if size >= one), ("B", 1.0))
-        rows.append(("written", f"{path} ({size / one:.3g} {unit})"))
-    return rows
 
 
 @contextlib.contextmanager

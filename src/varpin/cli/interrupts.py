@@ -11,8 +11,7 @@ from types import FrameType
 
 from rich.console import Console
 
-from varpin.cli.console import say
-from varpin.cli.exits import INTERRUPTED
+from varpin.cli.console import INTERRUPTED, say
 
 
 class Interrupts(contextlib.ExitStack):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,9 +11,8 @@ from typing import Any
 
 from rich.console import Console
 
-from varpin.cli.console import complain
-from varpin.cli.exits import INTERRUPTED, MISTAKE
-from varpin.cli.interrupts import Interrupts
+from varpin.cli.console import INTERRUPTED, MISTAKE, complain
+from varpin.control import Solution
 from varpin.errors import InputError, VarpinError
 from varpin.io.archive import atomic_file
 from varpin.marks import Marks
@@ -35,20 +34,14 @@ def add_outputs(parser: argparse.ArgumentParser, what: str) -> None:
 def add_replay_options(outputs: argparse._ActionsContainer) -> None:
     """Add options for files that show a motion."""
     outputs.add_argument("--html", type=Path, metavar="HTML", help="write a replay that any browser opens")
-    outputs.add_argument(
-        "--video", type=Path, metavar="MP4", help="write the replay as a video, mp4 or gif; needs varpin[video]"
-    )
+    outputs.add_argument("--video", type=Path, metavar="MP4", help="write a video, mp4 or gif; needs varpin[video]")
     outputs.add_argument("--trace", nargs="+", default=[], metavar="FRAME", help="draw the paths of frames in it")
-    outputs.add_argument(
-        "--speed",
-        type=float,
-        metavar="X",
-        help="speed of the replay; 0.1 is ten times slower; default: the scene file's, or 1",
-    )
+    text = "speed of the replay; 0.1 is ten times slower; default: the scene file's, or 1"
+    outputs.add_argument("--speed", type=float, metavar="X", help=text)
 
 
-# Functions that write a motion of a robot, by the path of the file.
-Writers = dict[Path, Callable[[Robot, Trajectory], object]]
+# Functions that write a motion of a robot, or the solution that it is of, by the path of the file.
+Writers = dict[Path, Callable[[Robot, Trajectory, Trajectory | Solution], object]]
 MarksOf = Callable[[float], Marks]
 
 
@@ -76,11 +69,11 @@ def writers_of(request: argparse.Namespace, marks: MarksOf | None = None) -> Wri
     return found
 
 
-def _save(path: Path, _robot: Robot, trajectory: Trajectory) -> None:
-    trajectory.save(path)
+def _save(path: Path, _robot: Robot, _trajectory: Trajectory, result: Trajectory | Solution) -> None:
+    result.save(path)
 
 
-def _plot(path: Path, robot: Robot, trajectory: Trajectory) -> None:
+def _plot(path: Path, robot: Robot, trajectory: Trajectory, _result: Trajectory | Solution) -> None:
     from varpin.show.plots import plot_trajectory  # noqa: PLC0415 - matplotlib is slow to import
 
     figure, _ = plot_trajectory(trajectory, robot=robot)
@@ -96,6 +89,7 @@ def _show(
     path: Path,
     robot: Robot,
     trajectory: Trajectory,
+    _result: Trajectory | Solution,
 ) -> None:
     from varpin.show.replay.motion import replay  # noqa: PLC0415 - meshcat is slow to import
 
@@ -110,24 +104,28 @@ def speed_of(request: argparse.Namespace) -> float:
 
 
 def write_all(
-    errors: Console, files: Mapping[Path, Callable[[], object]], interrupts: Interrupts
-) -> tuple[list[Path], int]:
-    """Write files, and print an error for each that cannot be written; the others, and the exit status.
+    request: argparse.Namespace,
+    errors: Console,
+    files: Writers,
+    robot: Robot,
+    trajectory: Trajectory,
+    result: Trajectory | Solution,
+) -> tuple[list[tuple[str, Path]], int]:
+    """Write files, and print an error for each that cannot be written; rows that name the others, and the exit status.
 
     Ctrl-C lets the current file be finished and leaves out the rest.
     """
-    written: list[Path] = []
-    status = 0
+    written, status, interrupts = [], 0, request.interrupts
     for path, write in files.items():
         if interrupts.wanted:
             complain(errors, f"{path} was not written: interrupted")
             continue
         try:
             with interrupts.written():
-                write()
+                write(robot, trajectory, result)
         except (VarpinError, OSError) as error:
             complain(errors, f"{path} was not written: {error}")
             status = MISTAKE
         else:
-            written.append(path)
+            written.append(("written", path))
     return written, INTERRUPTED if interrupts.wanted else status

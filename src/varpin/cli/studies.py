@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 from rich.console import Console
 
 from varpin.cli.arguments import add_motion, add_robot, motion_of, robot_options
-from varpin.cli.console import progress_bar, say, show
-from varpin.cli.exits import FAULTY, INTERRUPTED, STEP_FAILED
+from varpin.cli.console import FAULTY, INTERRUPTED, STEP_FAILED, progress_bar, say, show
 from varpin.errors import FileError
 from varpin.model import load_robot
 from varpin.study.advice import advise
@@ -38,9 +37,8 @@ def add_tradeoff(parser: argparse.ArgumentParser) -> None:
     add_robot(parser)
     _add_duration(parser)
     parser.add_argument("--dt", type=float, nargs="+", metavar="S", help="time steps [s]; default: 0.04 and its halves")
-    parser.add_argument(
-        "--repeats", type=int, default=3, metavar="N", help="repetitions of each run; default: %(default)d"
-    )
+    text = "repetitions of each run; default: %(default)d"
+    parser.add_argument("--repeats", type=int, default=3, metavar="N", help=text)
     add_motion(parser)
     _add_outputs(parser)
 
@@ -110,10 +108,8 @@ def _extremes(request: argparse.Namespace, errors: Console) -> int:
     robot = load_robot(request.robot, **robot_options(request))
     folder, patience = _folder(request), 900.0 if request.deep else 20.0
     if not request.quiet:
-        say(
-            errors,
-            f"each motion takes {patience:g} s at most; all together take {'hours' if request.deep else 'minutes'}",
-        )
+        whole = "hours" if request.deep else "minutes"
+        say(errors, f"each motion takes {patience:g} s at most; all together take {whole}")
     record = _kept(request, errors, lambda progress: check_robot(robot, patience=patience, progress=progress))
     if not request.quiet:
         _show_kinds(record)
@@ -126,9 +122,8 @@ def _extremes(request: argparse.Namespace, errors: Console) -> int:
 
 
 def _add_duration(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--duration", type=float, default=1.0, metavar="S", help="of the motion [s]; default: %(default)g"
-    )
+    text = "of the motion [s]; default: %(default)g"
+    parser.add_argument("--duration", type=float, default=1.0, metavar="S", help=text)
 
 
 def _add_outputs(parser: argparse.ArgumentParser, quiet: str | None = "print warnings and errors only") -> None:

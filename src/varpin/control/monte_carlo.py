@@ -17,8 +17,8 @@ from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import CostSum
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.verification import excess, percent
-from varpin.ensemble.looks import findings_of_paths, greater
 from varpin.ensemble.paths import Extremes, Shared, Task, chunks, simulate_paths, without_geometry
+from varpin.ensemble.statistics import findings_of_paths, greater
 from varpin.errors import VarpinError
 from varpin.finding import Finding, announce
 from varpin.mechanics.wiener import Children, children
@@ -188,9 +188,9 @@ def simulated(paths: Paths) -> Found:
     problem, extremes = paths.problem, Extremes()
     if paths.shared is not None:
         q0, v0 = (np.tile(x, (paths.last - paths.first, 1)) for x in (problem.q0, problem.v0))
-        part = simulate_paths(Task(paths.shared, paths.first, q0, v0, store=True, moments=False))
-        extremes, stored = part.extremes, part.stored
-        q, v, u = stored["q"], stored["v"], stored["u_nodes" if problem.linear else "u"]
+        names = "q", "v", "u_nodes" if problem.linear else "u"
+        part = simulate_paths(Task(paths.shared, paths.first, q0, v0, names, moments=False))
+        extremes, (q, v, u) = part.extremes, (part.stored[name] for name in names)
     else:
         q = v = np.full((1, problem.steps + 1, problem.scene.robot.dof), np.nan)
         u = np.full((1, problem.steps + problem.linear, problem.scene.controls), np.nan)
@@ -328,7 +328,8 @@ def _mean(parts: Sequence[Found], predicted: float, within: float, problem: Opti
         broken.append(Broken(problem.label_of(bound.source), *where, often, len(good), promised))
     return MonteCarlo(
         cost=float(good.mean()) + within,
-        standard_error=float(good.std(ddof=1) / np.sqrt(len(good))),
+        # Without noise all paths are the same, and differ by rounding.
+        standard_error=float(good.std(ddof=1) / np.sqrt(len(good))) if problem.scene.processes else 0.0,
         predicted=predicted,
         paths=len(good),
         failures=len(found.costs) - len(good),

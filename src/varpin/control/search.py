@@ -49,11 +49,9 @@ logger = logging.getLogger(__name__)
 # Errors that reject a trial, or end a search that has made a step.
 TRIAL_ERRORS = (CostError, NoiseFieldError, CustomForceError, StepError, LinearizationError)
 # The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu: it falls after
-# long steps and rises after a very short one, or after two short ones in a row.
+# long steps and rises after none, or after two short ones in a row.
 _GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e16
-_LONG, _SHORT, _VERY_SHORT = 0.25, 0.1, 0.01
-# Greatest regularization with which a search may end; from 1e-6 to 1e-2.
-_LITTLE = 1e-4
+_LONG, _SHORT = 0.25, 0.1
 # Iterations that together gain no more than the tolerance, or hardly lower violations, before a search ends.
 _PATIENCE = 10
 # Share of the violations that a search has to remove, at its end or in that many iterations; from 1e-3 to 1e-1.
@@ -63,10 +61,8 @@ _NOTHING = 1e-9
 # Weight of the rows in the merit: this many times the largest multiplier, and at most _HEAVY times, as heavy rows
 # shorten steps; where rows cannot all be met, this many times what the cost is per violation. From 3 to 100.
 _ABOVE, _HEAVY = 1.5, 10.0
-# Regularization from which on rows may be missed: it shortens steps only then; from 1e-4 to 1.
-_YIELDING = 1e-2
-# Slack of rows that are met, and of rows that a step approaches, relative to the violations; the latter from 0.5 on.
-_MET, _APPROACHED = 1e-6, 0.9
+# Slack of rows that are met, relative to the violations; from 1e-8 to 1e-4.
+_MET = 1e-6
 # Decrease, as a share of the cost at stake, from which on motions are looked at between nodes; from 1e-4 to 1e-2.
 _CLOSE = 1e-3
 # Greatest number of halvings of a trial's steps beyond those that the present motion needs; from 2 to 6.
@@ -341,14 +337,14 @@ class Search:
         program = Program(stages, rows, (least, most), plan, self.regularization if rows else 0.0)
         self.program = program
         values, bad = [row.values for row in rows], self._badness
-        found = None if rows and self.regularization > _YIELDING else program.minimum(values)
+        found = program.minimum(values)
         needed = np.inf if found is None else _ABOVE * _largest(found.multipliers)
         # Rows that cost far more than what is at stake are approached step by step.
         dear = max(self.weight, _HEAVY * (max(abs(self.cost), self.first) or program.stiffness))
         elastic = bool(rows) and needed > dear
         if elastic:
             missed = program.minimum(values, weight=dear)
-            elastic = missed is not None and (found is None or missed.slack <= _APPROACHED * bad)
+            elastic = missed is not None
             found, self.weight = (missed, dear) if elastic else (found, self.weight)
         self.unsolved = found is None
         if found is None:
@@ -411,7 +407,7 @@ class Search:
             # The cost is at its lower bound. Without costs of the controls the model may have no minimum even there.
             return Status.CONVERGED
         found = self._verdict(tolerance)
-        if found is not None and self.regularization > _LITTLE:
+        if found is not None and self.regularization > 0.0:
             # Not if the step without regularization gains more.
             kept = self.regularization, self.growth
             self.regularization = 0.0
@@ -633,7 +629,7 @@ class Search:
             self.regularization *= self.growth
             if self.regularization < _LEAST:
                 self.regularization = 0.0
-        elif lengths[-1] <= _VERY_SHORT or (max(lengths) <= _SHORT and len(lengths) > 1):
+        elif lengths[-1] == 0.0 or (max(lengths) <= _SHORT and len(lengths) > 1):
             return self._stiffen()
         return True
 

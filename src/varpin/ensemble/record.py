@@ -79,9 +79,8 @@ class Ensemble(Frozen):
         u: Controls applied (P, N, m).
         energy: Energy (P, N + 1) [J].
         failures: Paths that stopped early. The statistics leave a path out after its failure.
-        warnings: One of each kind: errors, limits, paths that stopped early. The first path, the one with
-            the most split steps, the one with the most energy and the fastest are examined as :func:`varpin.simulate`
-            examines its motion; of up to ten paths, all are.
+        warnings: One of each kind: errors, limits, paths that stopped early. The first path, the one with the most
+            split steps, the one with the most energy and the fastest are checked as :func:`varpin.simulate` does.
         integrator: The integrator of all paths.
     """
 

@@ -10,10 +10,9 @@ from contextlib import closing, suppress
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.ensemble.looks import findings_of_paths
 from varpin.ensemble.paths import Shared, simulate_paths, without_geometry
 from varpin.ensemble.record import Ensemble, EnsembleInterrupted
-from varpin.ensemble.statistics import Sums
+from varpin.ensemble.statistics import Sums, findings_of_paths
 from varpin.errors import InputError, VarpinError, WorkersLost
 from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
@@ -78,8 +77,9 @@ def simulate_ensemble(
             :class:`LinearPolicy`, evaluated at the state of each path.
 
     Other Args:
-        integrator: If left out, ``Midpoint(kick="held")``. In a scene without noise, the integrator that
-            :func:`varpin.simulate` takes for a few of the paths. ``Ensemble.integrator`` says which.
+        integrator: If left out, that of the policy of a plan under noise; else ``Midpoint(kick="held")``. In a scene
+            without noise, the integrator that :func:`varpin.simulate` takes for a few of the paths.
+            ``Ensemble.integrator`` says which.
         store: Keep every path. Otherwise only the statistics are kept, and memory does not grow with P N.
         quantiles: Levels in [0, 1]; with an empty list, workers return moments alone. Quantiles are of all paths if
             these are stored, or if P (N + 1) 2n is at most 33 million; otherwise of as many of the first paths,
@@ -119,6 +119,8 @@ def simulate_ensemble(
             raise InputError(f"controls are needed: {positions}")
         controls = scene.command_at(start[0][0])
     start, moved = _onto_constraints(scene, start)
+    if integrator is None and isinstance(controls, LinearPolicy):
+        integrator = controls.integrator
     if integrator is None:
         noisy = scene.processes > 0
         some = np.linspace(0, paths - 1, 1 if noisy else min(1 + paths // _OF, _CHOOSING)).astype(np.int64)
@@ -153,17 +155,14 @@ def simulate_ensemble(
 
 def _onto_constraints(scene: Scene, start: Sequence[Floats]) -> tuple[list[Floats], tuple[Finding, ...]]:
     """Initial states (P, n) projected onto the constraints, and the findings about the first path that was changed."""
-    q0, v0 = start
     if not scene.constraints:
-        return [q0, v0], ()
-    if (q0 == q0[0]).all() and (v0 == v0[0]).all():
-        q, v, found = on_constraints(scene, q0[0], v0[0])
-        return [np.broadcast_to(q, q0.shape), np.broadcast_to(v, v0.shape)], found
-    moved = [on_constraints(scene, q, v) for q, v in zip(q0, v0, strict=True)]
-    findings = (
-        tuple(finding.about(f"path {path}: ") for finding in found) for path, (_, _, found) in enumerate(moved) if found
-    )
-    return [np.array([q for q, _, _ in moved]), np.array([v for _, v, _ in moved])], next(findings, ())
+        return list(start), ()
+    alike = all((x == x[0]).all() for x in start)
+    starts = list(zip(*start, strict=True))[: 1 if alike else None]
+    q, v, found = zip(*(on_constraints(scene, *own) for own in starts), strict=True)
+    findings = ([finding.about(f"path {path}: " * (not alike)) for finding in own] for path, own in enumerate(found))
+    moved = [np.broadcast_to(np.array(x), start[0].shape) for x in (q, v)]
+    return moved, tuple(next((own for own in findings if own), []))
 
 
 def _alike(scene: Scene, start: Sequence[Floats]) -> tuple[Finding, ...]:

@@ -16,8 +16,9 @@ import secrets
 import socket
 import typing
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, fields, is_dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from enum import Enum
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, BinaryIO, TypeVar
@@ -30,7 +31,6 @@ from varpin.finding import Finding
 from varpin.support.checks import is_file, writable
 
 T = TypeVar("T")
-Members = Mapping[str, Any]
 
 
 class Axes:
@@ -65,9 +65,10 @@ class Entry:
         self.source, self.name = source, name
         with archive.open(f"{name}.npy") as stream:
             try:
-                read = _HEADERS[np.lib.format.read_magic(stream)]
+                version, _ = np.lib.format.read_magic(stream)
+                read = np.lib.format.read_array_header_1_0 if version == 1 else np.lib.format.read_array_header_2_0
                 self.shape, _, self.dtype = read(stream)
-            except (ValueError, KeyError) as error:
+            except ValueError as error:
                 raise FileError(f"{source}: {name} is not an array: {error}") from None
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
@@ -79,12 +80,6 @@ class Entry:
         except ValueError as error:
             raise FileError(f"{self.source}: {self.name} is not an array: {error}") from None
         return array if dtype is None else array.astype(dtype)
-
-
-_HEADERS: Mapping[tuple[int, int], Callable[..., Any]] = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
 
 
 def read_npz(source: Path, form: str | None = None) -> dict[str, Entry]:
@@ -128,110 +123,64 @@ def _opened(source: Path) -> Iterator[zipfile.ZipFile]:
 def members_of(record: Any, prefix: str = "") -> dict[str, Any]:
     """The entries of a record in an npz file, their names prefixed with ``prefix``."""
     members: dict[str, Any] = {}
-    kind: Any = type(record)
-    hints = _hints(kind)
-    for item in fields(record):
-        name, value, hint = prefix + _entry(item), getattr(record, item.name), _required(hints[item.name])
-        if value is None:
-            continue
+    for item, name, hint in _entries(type(record), prefix):
+        value = getattr(record, item.name)
         if is_dataclass(value):
             members |= members_of(value, f"{name}.")
-        elif (row := _row(hint)) is not None:
-            members |= {f"{name}.{own.name}": np.array([getattr(each, own.name) for each in value]) for own in row}
         elif isinstance(value, Mapping):
             members |= {f"{name}.{key}": array for key, array in value.items()}
-        else:
-            members[name] = np.array([_text(own) for own in value], dtype=np.str_) if _texts(hint) else value
+        elif isinstance(value, tuple) and is_dataclass(kind := typing.get_args(hint)[0]):
+            members |= {
+                f"{name}.{own.name}": np.array([_plain(getattr(each, own.name)) for each in value])
+                for own in fields(kind)
+            }
+        elif isinstance(value, tuple):
+            members[name] = np.array([_plain(own) for own in value], dtype=np.str_)
+        elif value is not None:
+            members[name] = _plain(value)
     return members
 
 
-def record_of(
-    kind: type[T], members: Members, source: Path, *, prefix: str = "", sizes: Mapping[str, int] | None = None
-) -> T:
-    """A record built from the entries of an npz file whose names begin with ``prefix``; ``sizes`` are known axes.
+def _plain(value: Any) -> Any:
+    """A value as files have it: a finding with its numbers as one text, and a member of an enumeration by its name."""
+    if isinstance(value, Finding):
+        return value.entry()
+    return value.name if isinstance(value, Enum) else value
 
-    Raises a FileError that names the file, the entry, and what is expected.
+
+def record_of(
+    kind: type[T],
+    members: Mapping[str, Entry],
+    source: Path,
+    sizes: Mapping[str, int] | None = None,
+    known: Mapping[str, Any] | None = None,
+) -> T:
+    """A record built from the entries of an npz file.
+
+    ``sizes`` are known axes, ``known`` the values of fields without an entry. Raises a FileError that names the file,
+    the entry, and what is expected.
     """
-    builder = _Builder(source, dict(sizes or {}))
-    record: T = builder.build(kind, builder.tables(kind, members, prefix), prefix.removesuffix("."))
+    record: T = _Reader(source, members, dict(sizes or {})).record(kind, "", known)
     return record
 
 
-class _Builder:
+@dataclass(frozen=True)
+class _Reader:
     """Records from the entries of a file."""
 
-    def __init__(self, source: Path, sizes: dict[str, int]) -> None:
-        self.source = source
-        self.sizes = sizes
+    source: Path
+    members: Mapping[str, Entry]
+    sizes: dict[Any, int]  # of the axes that are known so far
 
-    def tables(self, kind: Any, members: Members, prefix: str) -> dict[str, Any]:
-        """The entries of an npz file by field: records are tables."""
-        tables: dict[str, Any] = {}
-        hints = _hints(kind)
-        for item in fields(kind):
-            key, hint = _entry(item), _required(hints[item.name])
-            name = prefix + key
-            below = {
-                member.removeprefix(f"{name}."): entry
-                for member, entry in members.items()
-                if member.startswith(f"{name}.")
-            }
-            if is_dataclass(hint) and below:
-                tables[key] = self.tables(hint, members, f"{name}.")
-            elif name in members:
-                tables[key] = members[name]
-            elif typing.get_origin(hint) is Mapping or below:
-                tables[key] = below
-        return tables
+    def error(self, name: str, found: object, expected: str) -> FileError:
+        return FileError(f"{self.source}: {name} is {found} instead of {expected}")
 
-    def error(self, entry: str, found: str, expected: str) -> FileError:
-        return FileError(f"{self.source}: {entry or 'the file'} is {found} instead of {expected}")
-
-    def build(self, hint: Any, value: Any, entry: str) -> Any:
-        """Convert ``value``, an array or a table, to the type ``hint`` of a field."""
-        hint, optional = _required(hint), hint
-        if value is None and hint is not optional:
-            return None
-        if typing.get_origin(hint) in (Annotated, np.ndarray):
-            return self._array(hint, value, entry)
-        if isinstance(value, np.ndarray | Entry):
-            # A number or a text has no axes, a list has one.
-            if len(value.shape) > 1 or (value.shape and typing.get_origin(hint) is not tuple):
-                raise self.error(entry, f"{value.dtype} {value.shape}", "a single value or a list")
-            value = np.asarray(value).tolist()
-        if is_dataclass(hint):
-            return self._record(hint, value, entry)
-        if typing.get_origin(hint) is tuple:
-            return self._tuple(hint, value, entry)
-        if typing.get_origin(hint) is Mapping:
-            inner = typing.get_args(hint)[1]
-            return {name: self.build(inner, array, f"{entry}.{name}") for name, array in value.items()}
-        return self._scalar(hint, value, entry)
-
-    def _array(self, hint: Any, array: Any, entry: str) -> NDArray[Any]:
-        kind, axes = _array_type(hint)
-        found = array if isinstance(array, np.ndarray | Entry) else np.array(None)
-        names = axes.axes if axes is not None else found.shape
-        expected = tuple(self.sizes.get(name, name) if isinstance(name, str) else name for name in names)
-        fits = found.dtype == kind and len(found.shape) == len(expected)
-        if not fits or any(isinstance(a, int) and a != b for a, b in zip(expected, found.shape, strict=True)):
-            raise self.error(entry, f"{found.dtype} {found.shape}", f"{kind} ({', '.join(map(str, expected))})")
-        self.sizes |= {name: size for name, size in zip(names, found.shape, strict=True) if isinstance(name, str)}
-        whole = np.asarray(found)
-        if axes is not None and axes.finite and not np.isfinite(whole).all():
-            raise FileError(f"{self.source}: {entry} holds values that are not finite numbers")
-        whole.setflags(write=False)
-        return whole
-
-    def _record(self, kind: Any, value: Any, entry: str) -> Any:
-        if not isinstance(value, dict):
-            raise self.error(entry, reprlib.repr(value), "a table")
-        hints, given = _hints(kind), {}
-        for item in fields(kind):
-            key = _entry(item)
-            name = f"{entry}.{key}" if entry else key
-            if key in value:
-                given[item.name] = self.build(hints[item.name], value[key], name)
+    def record(self, kind: Any, prefix: str, known: Mapping[str, Any] | None = None) -> Any:
+        given = dict(known or {})
+        for item, name, hint in _entries(kind, prefix):
+            below = any(member.startswith(f"{name}.") for member in self.members)
+            if below or name in self.members or typing.get_origin(hint) is Mapping:
+                given[item.name] = self.value(hint, name)
             elif item.default is MISSING and item.default_factory is MISSING:
                 raise FileError(f"{self.source}: {name} is missing")
         try:
@@ -239,27 +188,68 @@ class _Builder:
         except InputError as error:
             raise FileError(f"{self.source}: {error}") from None
 
-    def _tuple(self, hint: Any, value: Any, entry: str) -> tuple[Any, ...]:
-        kinds = typing.get_args(hint)
-        if isinstance(value, dict):
-            # Records, by columns.
-            columns = {name: np.atleast_1d(column).tolist() for name, column in value.items()}
-            if len(set(map(len, columns.values()))) > 1:
-                raise self.error(entry, "columns of different lengths", "a table")
-            value = [dict(zip(columns, each, strict=True)) for each in zip(*columns.values(), strict=True)]
-        if not isinstance(value, list) or (kinds[-1] is not ... and len(value) != len(kinds)):
-            raise self.error(entry, reprlib.repr(value), "a list" if kinds[-1] is ... else f"a list of {len(kinds)}")
-        wanted = [kinds[0]] * len(value) if kinds[-1] is ... else kinds
-        pairs = enumerate(zip(wanted, value, strict=True))
-        return tuple(self.build(kind, item, f"{entry}[{index}]") for index, (kind, item) in pairs)
+    def value(self, hint: Any, name: str) -> Any:
+        """The value of type ``hint`` at a name, or of the entries below it."""
+        origin: Any = typing.get_origin(hint)
+        kinds: tuple[Any, ...] = typing.get_args(hint)
+        below = {own.removeprefix(f"{name}."): own for own in self.members if own.startswith(f"{name}.")}
+        if is_dataclass(hint):
+            return self.record(hint, f"{name}.")
+        if origin is Mapping:
+            return {key: self.array(kinds[1], own) for key, own in below.items()}
+        if origin in (Annotated, np.ndarray):
+            return self.array(hint, name)
+        if origin is not tuple:
+            return self.scalar(hint, self.listed(name, 0), name)
+        if not is_dataclass(kinds[0]):
+            return tuple(self.scalar(kinds[0], each, name) for each in self.listed(name, 1))
+        return self.rows(kinds[0], name)
 
-    def _scalar(self, kind: Any, value: Any, entry: str) -> Any:
-        if issubclass(kind, Finding):
-            return kind.of_entry(self._scalar(str, value, entry))
+    def rows(self, kind: Any, name: str) -> tuple[Any, ...]:
+        """Records by columns."""
+        columns = []
+        for _, own, hint in _entries(kind, f"{name}."):
+            columns.append([self.scalar(hint, each, own) for each in self.listed(own, 1)])
+        if len(set(map(len, columns))) > 1:
+            raise self.error(name, "columns of different lengths", "a table")
+        return tuple(kind(*row) for row in zip(*columns, strict=True))
+
+    def entry(self, name: str) -> Entry:
+        if name not in self.members:
+            raise FileError(f"{self.source}: {name} is missing")
+        return self.members[name]
+
+    def array(self, hint: Any, name: str) -> NDArray[Any]:
+        array, axes = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint, None)
+        kind, found = np.dtype(typing.get_args(typing.get_args(array)[1])[0]), self.entry(name)
+        names = found.shape if axes is None else axes.axes
+        expected = tuple(self.sizes.get(axis, axis) for axis in names)
+        fits = found.dtype == kind and len(found.shape) == len(expected)
+        if not fits or any(isinstance(a, int) and a != b for a, b in zip(expected, found.shape, strict=True)):
+            raise self.error(name, f"{found.dtype} {found.shape}", f"{kind} ({', '.join(map(str, expected))})")
+        self.sizes.update((axis, size) for axis, size in zip(names, found.shape, strict=True) if isinstance(axis, str))
+        whole = np.asarray(found)
+        if axes is not None and axes.finite and not np.isfinite(whole).all():
+            raise FileError(f"{self.source}: {name} holds values that are not finite numbers")
+        whole.setflags(write=False)
+        return whole
+
+    def listed(self, name: str, axes: int) -> Any:
+        """A single value, or a list of them."""
+        found = self.entry(name)
+        if len(found.shape) != axes:
+            raise self.error(name, f"{found.dtype} {found.shape}", "a list" if axes else "a single value")
+        return np.asarray(found).tolist()
+
+    def scalar(self, kind: Any, value: Any, name: str) -> Any:
+        if issubclass(kind, Finding) and isinstance(value, str):
+            return kind.of_entry(value)
+        if issubclass(kind, Enum) and value in kind.__members__:
+            return kind[value]
         if kind is float and type(value) is int and abs(value) < 2**53:
             return float(value)
         if type(value) is not kind:
-            raise self.error(entry, reprlib.repr(value), f"a value of type {kind.__name__}")
+            raise self.error(name, reprlib.repr(value), f"a value of type {kind.__name__}")
         return value
 
 
@@ -268,40 +258,18 @@ def _hints(kind: Any) -> dict[str, Any]:
     return typing.get_type_hints(kind, include_extras=True)
 
 
-def _entry(item: Any) -> str:
-    """The name of a field in files: ``entry`` of its metadata, or else the name of the field."""
-    return str(item.metadata.get("entry", item.name))
+def _entries(kind: Any, prefix: str) -> Iterator[tuple[Any, str, Any]]:
+    """Each field of a record, its name in files, and its type, never None.
 
-
-def _required(hint: Any) -> Any:
-    """An annotation without None."""
-    if typing.get_origin(hint) not in (UnionType, typing.Union):
-        return hint
-    (option,) = (option for option in typing.get_args(hint) if option is not NoneType)
-    return option
-
-
-def _texts(hint: Any) -> bool:
-    """Whether an annotation is ``tuple[str, ...]``, or of findings."""
-    return typing.get_origin(hint) is tuple and typing.get_args(hint)[0] in (str, Finding)
-
-
-def _row(hint: Any) -> Sequence[Any] | None:
-    """The fields of the records in an annotation ``tuple[record, ...]``; None of others."""
-    kinds = typing.get_args(hint) if typing.get_origin(hint) is tuple else (None,)
-    return fields(kinds[0]) if is_dataclass(kinds[0]) else None
-
-
-def _text(value: str) -> str:
-    """A text, or a finding with its numbers, as one string."""
-    return value.entry() if isinstance(value, Finding) else value
-
-
-def _array_type(hint: Any) -> tuple[np.dtype[Any], Axes | None]:
-    """The type of an array's entries, and its axes if they are annotated."""
-    array, axes = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint, None)
-    (scalar,) = typing.get_args(typing.get_args(array)[1])
-    return np.dtype(scalar), axes
+    The metadata of a field may have its name as ``entry``, or None where files do not have it.
+    """
+    for item in fields(kind):
+        if item.metadata.get("entry", item.name) is None:
+            continue
+        hint = _hints(kind)[item.name]
+        if typing.get_origin(hint) in (UnionType, typing.Union):
+            (hint,) = (option for option in typing.get_args(hint) if option is not NoneType)
+        yield item, prefix + item.metadata.get("entry", item.name), hint
 
 
 @contextlib.contextmanager

@@ -104,7 +104,7 @@ def joint_array(
     array = np.full(len(joints), absent)
     for joint, number in value.items():
         if joint not in joints:
-            raise UnknownJoint(str(joint), joints, name, lack)
+            raise UnknownJoint(str(joint), joints, f"{name}: {lack}")
         array[joints.index(joint)] = (real if limit else finite)(f"{name}[{joint!r}]", number)
     return array
 
@@ -133,39 +133,29 @@ def control_values(
     return broadcast_array(name, value, size) if uniform else finite_array(name, value, (size,))
 
 
-def checked_limits(name: str, limits: tuple[ArrayLike, ArrayLike] | None, size: int) -> Floats:
-    """(lower, upper), each one number or (size,), as an array (2, size); infinite where there is no limit."""
-    pair = (-np.inf, np.inf) if limits is None else limits
+def named_limits(
+    name: str, limits: tuple[JointValues, JointValues] | None, joints: Sequence[str] | None, size: int
+) -> Floats:
+    """(lower, upper), each one number, (size,) or by the names of ``joints``, as (2, size); infinite for no limit."""
+    pair: Any = (-np.inf, np.inf) if limits is None else limits
     if not isinstance(pair, tuple | list | np.ndarray) or len(pair) != 2:
         both_sides = f"; for +-{limits:g} write (-{limits:g}, {limits:g})" if isinstance(limits, int | float) else ""
         raise InputError(f"{name} must be a pair (lower, upper), got {limits!r}{both_sides}")
     both = np.empty((2, size))
-    for row, side, value in zip(both, ("lower", "upper"), pair, strict=True):
-        array = as_floats(f"{name}: {side}", value)
-        if array.shape not in ((), (size,)):
-            raise InputError(f"{name}: {side} must be one number or have shape ({size},), got {array.shape}")
-        row[:] = array
+    for row, side, value, none in zip(both, ("lower", "upper"), pair, (-np.inf, np.inf), strict=True):
+        what = f"{name}: {side}"
+        if isinstance(value, Mapping):
+            row[:] = control_array(what, value, joints, absent=none)
+        else:
+            row[:] = broadcast_array(what, value, size, limit=True)
         if np.isnan(row).any():
-            raise InputError(f"{name}: {side}[{int(np.argmax(np.isnan(row)))}] is NaN; inf stands for no limit")
+            raise InputError(f"{what}[{int(np.argmax(np.isnan(row)))}] is NaN; inf stands for no limit")
     wrong = ~(both[0] <= both[1]) | (both[0] == np.inf) | (both[1] == -np.inf)
     if wrong.any():
         c = int(np.argmax(wrong))
         raise InputError(f"{name}: nothing is within {both[0, c]:g} and {both[1, c]:g}, the limits of entry {c}")
     both.setflags(write=False)
     return both
-
-
-def named_limits(
-    name: str, limits: tuple[JointValues, JointValues] | None, joints: Sequence[str] | None, size: int
-) -> Floats:
-    """:func:`checked_limits` of controls; a side may be given by the names of their ``joints``."""
-    sides: Any = limits
-    if isinstance(limits, tuple | list) and len(limits) == 2:
-        sides = tuple(
-            control_array(f"{name}: {side}", value, joints, absent=none) if isinstance(value, Mapping) else value
-            for side, value, none in zip(("lower", "upper"), limits, (-np.inf, np.inf), strict=True)
-        )
-    return checked_limits(name, sides, size)
 
 
 def some_limits(
@@ -302,18 +292,14 @@ def writable(path: str | os.PathLike[str]) -> Path:
     """``path`` with links resolved, checked before any work is done for the file."""
     target = path_like("path", path).resolve()
     try:
-        target.lstat()
-    except FileNotFoundError:
-        pass
+        exists = target.exists()
     except OSError as error:
         raise FileError(f"cannot write a file of that name, {target.name[:40]!r}: {error.strerror}") from None
-    if target.is_dir():
-        raise FileError(f"cannot write {target}: it is a folder")
-    if target.exists() and not target.is_file():
-        raise FileError(f"cannot write {target}: it is a device or pipe")
+    if exists and not target.is_file():
+        raise FileError(f"cannot write {target}: it is a folder, a device or a pipe")
     if not target.parent.is_dir():
         raise FileError(f"cannot write {target}: there is no folder {target.parent}")
-    if not os.access(target if target.exists() else target.parent, os.W_OK):
+    if not os.access(target if exists else target.parent, os.W_OK):
         raise FileError(f"cannot write {target}: permission denied")
     return target
 

@@ -21,7 +21,7 @@ from varpin.control.constraints.base import (
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
 from varpin.model.kinematics import frame_kinematics, require_same
-from varpin.support.checks import checked_limits, finite, finite_array, over_time, positive, rotation_matrix
+from varpin.support.checks import finite, finite_array, named_limits, over_time, positive, rotation_matrix
 
 _XYZ = ("x", "y", "z")
 # Scale: a tenth of a large rotation [rad].
@@ -228,7 +228,7 @@ class KeepInBox(_WithinPlanes):
             upper: Likewise.
         """
         self._take(robot, frame)
-        self.limits = checked_limits("KeepInBox", (lower, upper), 3)
+        self.limits = named_limits("KeepInBox", (lower, upper), None, 3)
         if not np.isfinite(self.limits).any():
             raise InputError("KeepInBox has no finite side")
         self.margin = checked_margin(self, margin)

@@ -27,11 +27,11 @@ def marks_of(task: Task, duration: float, constraints: Scene | OptimalControlPro
     targets: dict[str, Floats] = {}
     references: dict[str, Floats] = {}
     for term in positions:
-        orientation = next((other for other in orientations if _of_one_frame(term, other)), None)
+        same = [other for other in orientations if (other.frame, other.terminal) == (term.frame, term.terminal)]
         name = "target" if len(positions) == 1 else f"target of {term.frame}"
         while name in targets:
             name += "'"
-        targets[name] = _target(term, orientation, duration)
+        targets[name] = _target(term, same, duration)
         path = _values(term, duration)
         if len(path) > 1 and np.ptp(path, axis=0).any():
             references[f"path of {name}"] = path
@@ -39,11 +39,6 @@ def marks_of(task: Task, duration: float, constraints: Scene | OptimalControlPro
     frames = list(dict.fromkeys(term.frame for term in positions))
     trace = frames or ghost is not None
     return Marks(trace=trace, targets=targets, reference=references or None, ghost=ghost, constraints=constraints)
-
-
-def _of_one_frame(position: Term, orientation: Term) -> bool:
-    """Whether two terms have the same frame, both over time or both at the end."""
-    return position.frame == orientation.frame and position.terminal == orientation.terminal
 
 
 def _values(term: Term, duration: float) -> Floats:
@@ -55,14 +50,13 @@ def _values(term: Term, duration: float) -> Floats:
     return term.target.at(t[:1] if term.target.constant else t)
 
 
-def _target(position: Term, orientation: Term | None, duration: float) -> Floats:
+def _target(position: Term, orientations: list[Term], duration: float) -> Floats:
     """Target positions (K, 3) of a frame, or poses (K, 4, 4) with a target of its orientation."""
     points = _values(position, duration)
-    if orientation is None:
+    if not orientations:
         return points
-    angles = _values(orientation, duration)
-    rows = max(len(points), len(angles))
-    poses = np.tile(np.eye(4), (rows, 1, 1))
+    angles = _values(orientations[0], duration)
+    poses = np.tile(np.eye(4), (max(len(points), len(angles)), 1, 1))
     poses[:, :3, 3] = points
     # As in a URDF: Rz(yaw) Ry(pitch) Rx(roll).
     poses[:, :3, :3] = scipy.spatial.transform.Rotation.from_euler("xyz", angles).as_matrix()

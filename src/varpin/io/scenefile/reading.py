@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.errors import FileError, InputError, UnknownJoint, VarpinError
+from varpin.errors import FileError, InputError, VarpinError
 from varpin.model import Robot, looks_like_degrees
 from varpin.support.checks import finite, is_file
 
@@ -42,15 +42,10 @@ class SceneFileError(VarpinError, ValueError):
 
 @dataclass(frozen=True)
 class Where:
-    """A place in a scene file.
-
-    Attributes:
-        path: The file.
-        key: The key of a value or a table; empty for the top level.
-    """
+    """A place in a scene file."""
 
     path: Path
-    key: str = ""
+    key: str = ""  # of a value or a table; empty for the top level
 
     def at(self, *names: str | int) -> Where:
         """The place of an entry."""
@@ -63,13 +58,13 @@ class Where:
 
     def of(self, error: VarpinError, given: Mapping[str, Any]) -> SceneFileError:
         """An error of the API about the keys ``given`` of this table: that of the key which the error is about."""
-        name = error.joint if isinstance(error, UnknownJoint) else getattr(error, "frame", "")
+        name = getattr(error, "name", "")
         for key, value in given.items() if name else ():
             if isinstance(value, Mapping) and name in value:
                 return self.at(key, name).error(str(error))
             # A name, several of them, or a point in a frame.
             parts = value if isinstance(value, list | tuple) else (value,)
-            if name in [part for part in parts if isinstance(part, str)]:
+            if name in [part for own in parts if isinstance(part := getattr(own, "frame", own), str)]:
                 return self.at(key).error(str(error))
         # A name of one letter is a word, too.
         found = {key: re.search(rf"\b{key}\b" if len(key) > 1 else rf"\b{key}(?=,| must)", str(error)) for key in given}

@@ -176,16 +176,7 @@ KINDS: tuple[Any, ...] = (Samples, Waypoints, Sines)
 def timeline(
     given: Any, where: Where, names: Sequence[str], what: str, robot: Robot, horizon: tuple[float, float]
 ) -> Timeline:
-    """The values over time of a reference, for the components ``names``; a posture for joints.
-
-    Args:
-        given: The value of the key.
-        where: Its place.
-        names: Names of the components.
-        what: What one of them is.
-        robot: The robot.
-        horizon: The time step and the duration [s].
-    """
+    """The values over time of a reference; ``what`` is one of its components, the horizon the step and the duration."""
     for kind in KINDS:
         if isinstance(given, Mapping) and given.keys() & {item.name for item in fields(kind)}:
             found: Timeline = where.call(kind, given).timeline(where, names, what, horizon)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from varpin.arrays import Floats, Mask
 from varpin.control.constraints import PlanConstraint
 from varpin.control.costs import Cost, CostSum, Terminal
-from varpin.errors import InputError, RobotNotFound, UnknownFrame, VarpinError
+from varpin.errors import InputError, RobotNotFound, VarpinError
 from varpin.io.scenefile import kinds
 from varpin.io.scenefile.reading import SceneFileError, Where
 from varpin.io.scenefile.references import Timeline, constant, timeline
@@ -42,27 +42,16 @@ TABLES = (
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """A term of the cost.
-
-    Attributes:
-        where: Its place.
-        kind: Its type in the file.
-        options: Other keys than these.
-        terminal: Whether it is a cost at the end instead of an integral over time.
-        weight: Weights of its components (c,).
-        target: Their target over time, if there is one.
-        hold: Configuration (n,) that its reference is to hold [rad or m].
-        names: The joints of its components; None for components that are not joints.
-    """
+    """A term of the cost."""
 
     where: Where
-    kind: str
-    options: Mapping[str, Any]
-    terminal: bool
-    weight: Floats
-    target: Timeline | None
-    hold: Floats | None
-    names: tuple[str, ...] | None
+    kind: str  # its type in the file
+    options: Mapping[str, Any]  # other keys than these
+    terminal: bool  # whether it is a cost at the end instead of an integral over time
+    weight: Floats  # of its components (c,)
+    target: Timeline | None  # of its components
+    hold: Floats | None  # configuration (n,) that its reference is to hold [rad or m]
+    names: tuple[str, ...] | None  # the joints of its components; None for components that are not joints
 
     @property
     def frame(self) -> str:
@@ -112,35 +101,20 @@ class _Turning:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A scene file on a robot, complete or without some of its joints.
-
-    Attributes:
-        where: The file.
-        tables: Its content.
-        scene: The scene.
-        q0: Initial configuration (n,) [rad or m].
-        v0: Initial velocity (n,) [rad/s or m/s].
-        dt: Time step [s].
-        steps: N.
-        driven: Names of the driven joints (m).
-        gear: Generalized force per control (m,).
-        torque_limit: Bounds (m,) [N m or N], infinite where there is none.
-        terms: Terms of the cost.
-        controls: Controls of a simulation over time; None for none, ``"hold"`` for those that hold the robot at q0.
-    """
+    """A scene file on a robot, complete or without some of its joints."""
 
     where: Where
-    tables: Mapping[str, Any]
+    tables: Mapping[str, Any]  # the content of the file
     scene: Scene
-    q0: Floats
-    v0: Floats
-    dt: float
+    q0: Floats  # (n,) [rad or m]
+    v0: Floats  # (n,) [rad/s or m/s]
+    dt: float  # [s]
     steps: int
-    driven: tuple[str, ...]
-    gear: Floats
-    torque_limit: Floats
-    terms: tuple[Term, ...] = ()
-    controls: Timeline | str | None = None
+    driven: tuple[str, ...]  # names of the driven joints (m)
+    gear: Floats  # generalized force per control (m,)
+    torque_limit: Floats  # (m,) [N m or N], infinite where there is none
+    terms: tuple[Term, ...] = ()  # of the cost
+    controls: Timeline | str | None = None  # of a simulation; "hold" for those that hold the robot at q0
 
     def require_start(self) -> None:
         """Refuse a start off the constraints."""
@@ -298,29 +272,20 @@ def task_of(root: Where, tables: dict[str, Any]) -> Task:
         raise at.of(error, horizon) from None
     if steps * max(1, _PER_COST * costs) > _MOST_STEPS:
         raise at.error(f"{steps} steps are more than {_MOST_STEPS}, or a tenth of that divided by the number of costs")
-    robot = _robot(root.at("robot"), tables["robot"])
-    try:
-        return _on_robot(root, tables, robot, dt, steps)
-    except SceneFileError as error:
-        name = error.key.rpartition(".")[2]
-        if name not in robot.locked:
-            raise
-        raise SceneFileError(error.source, error.key, f"the joint is locked at {robot.locked[name]}") from None
+    return _on_robot(root, tables, _robot(root.at("robot"), tables["robot"]), dt, steps)
 
 
 def _robot(where: Where, given: Any) -> Robot:
     """The robot of a file, or several in one."""
     if not isinstance(given, list):
         return _one(where, given)
-    if len(given) < 2:
-        raise where.error(f"[[robot]] is for two robots or more, got {len(given)}; one is written [robot]")
     members = [(place, dict(place.table(own))) for place, own in where.tables(given)]
     prefixes = [place.at("prefix").text(own.pop("prefix")) if "prefix" in own else "" for place, own in members]
     robots = [_one(place, own) for place, own in members]
     try:
         return combine(*robots, prefixes=prefixes)
     except InputError as error:
-        raise where.at(len(robots) - 1, "prefix").error(str(error)) from None
+        raise where.error(str(error)) from None
 
 
 def _one(where: Where, given: Any) -> Robot:
@@ -329,14 +294,14 @@ def _one(where: Where, given: Any) -> Robot:
     source = where.at("source").text(own["source"])
     if "." in source or "/" in source or "\\" in source:
         own["source"] = where.at("source").file(source)
-    for key, read in (("srdf", where.at("srdf").file), ("base", _placement(where.at("base")))):
-        own |= {key: read(own[key])} if key in own else {}
+    if "srdf" in own:
+        own["srdf"] = where.at("srdf").file(own["srdf"])
+    if isinstance(base := own.get("base"), dict):
+        own["base"] = _placement(where.at("base"), base)
     folders = own.get("package_dirs", [])
     if isinstance(folders, list) and folders:
         own["package_dirs"] = [where.at("package_dirs", k).beside(folder) for k, folder in enumerate(folders)]
     payloads = where.at("payload").tables(own.get("payload", []))
-    for place, load in payloads:
-        place.at("frame").text(place.table(load).get("frame", "?"))
     own["payload"] = [place.call(Payload, load) for place, load in payloads]
     lock = own.get("lock", {})
     for joint, value in lock.items() if isinstance(lock, dict) else ():
@@ -347,26 +312,17 @@ def _one(where: Where, given: Any) -> Robot:
     except SceneFileError as error:
         if isinstance(error.__context__, RobotNotFound):
             raise where.at("source").error(error.problem) from None
-        if isinstance(error.__context__, UnknownFrame):
-            index = [load.frame for load in own["payload"]].index(error.__context__.frame)
-            raise where.at("payload", index, "frame").error(error.problem) from None
         raise
 
 
-def _placement(where: Where) -> Any:
-    """Function that reads the placement of a base: a word, or its place and its angles."""
-
-    def read(given: Any) -> Any:
-        if not isinstance(given, dict):
-            return where.one_of(given, ("planar",))
-        where.table(given, ("xyz", "rpy"))
-        still, transform = [0.0, 0.0, 0.0], np.eye(4)
-        angles = where.at("rpy").numbers(given.get("rpy", still), kinds.ANGLES, "angle")
-        transform[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
-        transform[:3, 3] = where.at("xyz").numbers(given.get("xyz", still), ("x", "y", "z"), "axis")
-        return transform
-
-    return read
+def _placement(where: Where, given: dict[str, Any]) -> Floats:
+    """The placement (4, 4) of a base: its place and its angles."""
+    where.table(given, ("xyz", "rpy"))
+    transform = np.eye(4)
+    angles = where.at("rpy").numbers(given.get("rpy", 0.0), kinds.ANGLES, "angle")
+    transform[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
+    transform[:3, 3] = where.at("xyz").numbers(given.get("xyz", 0.0), ("x", "y", "z"), "axis")
+    return transform
 
 
 def _on_robot(root: Where, tables: Mapping[str, Any], robot: Robot, dt: float, steps: int) -> Task:
@@ -388,9 +344,9 @@ def _on_robot(root: Where, tables: Mapping[str, Any], robot: Robot, dt: float, s
         "friction": tables.get("friction"),
         "stiffness": springs.get("stiffness", 0.0),
         "rest": root.at("springs", "rest").positions(springs.get("rest", 0.0), robot),
-        "forces": _forces(root.at("force"), tables.get("force", []), robot, matrix.any(axis=1), driven, limit),
+        "forces": _forces(root.at("force"), tables.get("force", []), robot, driven, limit),
         "actuation": matrix,
-        "noise": _noise(root.at("noise"), tables.get("noise", []), robot, matrix, driven) or None,
+        "noise": _noise(root.at("noise"), tables.get("noise", []), robot, driven) or None,
         "constraints": constraints or None,
     }
     try:
@@ -399,27 +355,21 @@ def _on_robot(root: Where, tables: Mapping[str, Any], robot: Robot, dt: float, s
         words = {"stiffness": "springs.stiffness", "Noise": "noise", "control": "actuation", "Servo": "force"}
         key = next((key for word, key in words.items() if word in str(error)), root.of(error, given).key)
         raise SceneFileError(root.path.name, key, str(error)) from None
-    task = Task(
-        root,
-        tables,
-        scene,
-        q0,
-        root.at("initial", "v").numbers(initial.get("v", 0.0), names),
-        dt,
-        steps,
-        driven,
-        gear,
-        limit,
-    )
+    v0 = root.at("initial", "v").numbers(initial.get("v", 0.0), names)
+    task = Task(root, tables, scene, q0, v0, dt, steps, driven, gear, limit)
     horizon = dt, dt * steps
     terms = [_term(where, cost, task, horizon) for where, cost in root.at("cost").tables(tables.get("cost", []))]
     where = root.at("simulate")
     controls = where.table(tables.get("simulate", {}), ("controls", "seed")).get("controls")
     if controls is not None and controls != "hold":
         controls = timeline(controls, where.at("controls"), driven, "driven joint", robot, horizon)
-    task = replace(task, terms=tuple(terms), controls=controls)
-    _require_controls(task)
-    return task
+        force = np.abs(controls.at(task.times) * gear).max(axis=0)
+        over = (force > limit * (1.0 + _ROUNDING)) & ~task.positions
+        if over.any():
+            k = int(np.argmax(over))
+            told = f"of {driven[k]!r} reach {force[k]:g} N m or N; torque_limit is {limit[k]:g}"
+            raise where.at("controls").error(told)
+    return replace(task, terms=tuple(terms), controls=controls)
 
 
 def _actuation(where: Where, given: Any, robot: Robot) -> tuple[tuple[str, ...], Floats, Floats]:
@@ -459,9 +409,8 @@ def _bound(where: Where, kind: Any, own: dict[str, Any], robot: Robot) -> Any:
     return made
 
 
-def _forces(where: Where, given: Any, robot: Robot, *effort: Any) -> list[Force]:
+def _forces(where: Where, given: Any, robot: Robot, driven: Sequence[str], limit: Floats) -> list[Force]:
     """The forces of a file. Torque limits of driven joints bound the effort of servos."""
-    _, driven, limit = effort
     most = np.full(robot.dof, np.inf)
     most[[robot.coordinate(joint) for joint in driven]] = limit
     found: list[Force] = []
@@ -479,26 +428,16 @@ def _forces(where: Where, given: Any, robot: Robot, *effort: Any) -> list[Force]
     return found
 
 
-def _noise(where: Where, given: Any, robot: Robot, actuation: Floats, driven: Sequence[str]) -> list[Noise]:
-    """The noise models of a file, with their nonzero processes alone."""
+def _noise(where: Where, given: Any, robot: Robot, driven: Sequence[str]) -> list[Noise]:
+    """The noise models of a file."""
     found: list[Noise] = []
     for place, table in where.tables(given):
         word, kind, own = place.kind(table, kinds.NOISE)
-        of_control, at = word == "control", place.at("intensity")
-        place.table(own, ("intensity", "center") if word == "state" else ("intensity",), ("intensity",))
-        whose, what = (driven, "driven joint") if of_control else (robot.joint_names, "joint")
-        intensity: Floats = at.numbers(own["intensity"], whose, what)
-        act = np.flatnonzero(intensity)
-        if not len(act):
-            continue
+        whose, what = (driven, "driven joint") if word == "control" else (robot.joint_names, "joint")
+        if "intensity" in own:
+            own["intensity"] = place.at("intensity").numbers(own["intensity"], whose, what)
         if "center" in own:
             own["center"] = place.at("center").positions(own["center"], robot)
-        own["intensity"] = intensity
-        if of_control:
-            own["intensity"] = np.zeros((robot.dof, len(act), len(driven)))
-            own["intensity"][:, np.arange(len(act)), act] = (actuation * intensity)[:, act]
-        elif word == "additive":
-            own["intensity"] = np.diag(intensity)[:, act]
         found.append(place.call(kind, own))
     return found
 
@@ -536,15 +475,3 @@ def _term(where: Where, table: Any, task: Task, horizon: tuple[float, float]) ->
     if (limits := term.limits(robot)) is not None and not np.isfinite(limits).any():
         raise where.at("type").error(f"robot {robot.name!r} has no such limits")
     return term
-
-
-def _require_controls(task: Task) -> None:
-    """Refuse forces of a simulation beyond the limits."""
-    if not isinstance(task.controls, Timeline):
-        return
-    force = np.abs(task.controls.at(task.times) * task.gear).max(axis=0)
-    limit = np.where(task.positions, np.inf, task.torque_limit)
-    if (force > limit * (1.0 + _ROUNDING)).any():
-        k = int(np.argmax(force - limit))
-        told = f"of {task.driven[k]!r} reach {force[k]:g} N m or N; torque_limit is {limit[k]:g}"
-        raise task.where.at("simulate", "controls").error(told)

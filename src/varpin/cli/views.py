@@ -1,4 +1,4 @@
-"""``varpin replay``: show a saved motion."""
+"""``varpin replay``, ``varpin inspect`` and ``varpin robots``: saved motions and robot descriptions, shown."""
 
 from __future__ import annotations
 
@@ -6,42 +6,45 @@ import argparse
 import logging
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
-from varpin.cli.arguments import ROBOT_OPTIONS, add_robot_options, names_scene, robot_options, scene_file
+from varpin.cli.arguments import (
+    add_gravity,
+    add_robot,
+    add_robot_options,
+    add_vector,
+    names_scene,
+    robot_options,
+    scene_file,
+    values_of,
+)
 from varpin.cli.console import say, show
 from varpin.cli.outputs import add_replay_options, speed_of, write_all, writers_of
 from varpin.control import solution_trajectory
-from varpin.errors import FileError, InputError, RobotNotFound
+from varpin.errors import InputError, RobotNotFound
 from varpin.io.archive import read_format
 from varpin.io.scenefile import SceneFile
 from varpin.marks import Marks
-from varpin.model import Robot, load_robot
+from varpin.model import Robot, load_robot, robot_names
 from varpin.show.given import frame_names
+from varpin.show.inspection import inspect_robot
 from varpin.support.checks import path_like
+from varpin.support.tables import Table
 from varpin.trajectory import Trajectory
 
 
 def add_replay(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin replay``."""
-    parser.description = (
-        "Show a motion that simulate or solve has saved: in a window of the web browser, until Ctrl-C; or as a page "
-        "or a video."
-    )
+    parser.description = "Show a saved motion in a window of the web browser, until Ctrl-C; or as a page or a video."
     parser.set_defaults(run=_replay, log_level=logging.WARNING)
     parser.add_argument("motion", type=Path, metavar="NPZ", help="a trajectory or a solution, as --save writes it")
-    parser.add_argument(
-        "--robot",
-        metavar="ROBOT",
-        help="path of a URDF file, or name of a robot; or a scene file (TOML), or name of a scene, whose task is shown "
-        "too; default: the robot named in the motion",
-    )
+    text = "a robot, or a scene file, whose task is shown too; default: the robot named in the motion"
+    parser.add_argument("--robot", metavar="ROBOT", help=text)
     add_robot_options(parser)
     outputs = parser.add_argument_group("outputs")
-    outputs.add_argument("--open", action="store_true", help="open a window; the default without an output file")
     add_replay_options(outputs)
     outputs.add_argument("--ghost", type=Path, metavar="NPZ", help="a second motion of the robot, drawn translucent")
     outputs.add_argument("--frames", nargs="+", default=[], metavar="FRAME", help="draw frames as triads")
@@ -49,9 +52,6 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
 
 
 def _replay(request: argparse.Namespace, errors: Console) -> int:
-    asked = request.html is not None or request.video is not None
-    if asked and request.open:
-        raise InputError("--open shows a window, and --html and --video write files: give one or the other")
     first = _motion(request.motion)
     robot, scene = _robot(request, first)
     motion = _motion(request.motion, robot)
@@ -61,14 +61,13 @@ def _replay(request: argparse.Namespace, errors: Console) -> int:
     for name, frames in (("trace", trace), ("frames", request.frames)):
         frame_names(f"--{name}", [robot], frames)
     marks = replace(marks, ghost=ghost, trace=trace, frames=request.frames, torques=request.torques)
-    if not asked:
-        return _window(request, errors, robot, motion, marks)
     writers = writers_of(request, lambda _duration: marks)
-    files = {path: partial(write, robot, motion) for path, write in writers.items()}
+    if not writers:
+        return _window(request, errors, robot, motion, marks)
     with request.interrupts.keeping():
-        written, status = write_all(errors, files, request.interrupts)
-    for path in written:
-        show(f"written: {path}")
+        written, status = write_all(request, errors, writers, robot, motion, motion)
+    for row in written:
+        show("{}: {}".format(*row))
     return status
 
 
@@ -95,22 +94,51 @@ def _motion(path: Path, robot: Robot | None = None) -> Trajectory:
 def _robot(request: argparse.Namespace, motion: Trajectory) -> tuple[Robot, SceneFile | None]:
     """The robot of the motion, and its scene if ``--robot`` names one."""
     if request.robot is not None and names_scene(request.robot):
-        scene = scene_file(request, request.robot, *ROBOT_OPTIONS)
+        scene = scene_file(request, request.robot)
         return scene.robot, scene
     name = request.robot or motion.robot
     try:
-        robot = load_robot(name, **robot_options(request))
+        return load_robot(name, **robot_options(request)), None
     except RobotNotFound as error:
         if request.robot is not None:
             raise
-        raise InputError(
-            f"{request.motion} is of robot {motion.robot!r}, a name that varpin does not know: give its URDF file or "
-            "its scene file as --robot"
-        ) from error
-    missing = [joint for joint in robot.joint_names if joint not in motion.joint_names]
-    if missing and set(motion.joint_names) < set(robot.joint_names):
-        raise FileError(
-            f"{request.motion} has no motion of {', '.join(missing)}: lock them as they were, "
-            f"--lock {' '.join(f'{joint}=VALUE' for joint in missing)}, or give the scene file as --robot"
-        )
-    return robot, None
+        text = f"{request.motion} is of robot {name!r}: give its URDF file or its scene file as --robot"
+        raise InputError(text) from error
+
+
+def add_inspect(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``varpin inspect``."""
+    parser.description = (
+        "Print a robot's joints, links, masses and frames, the largest step that Midpoint accepts, and whatever looks "
+        "wrong. Takes robots that simulate refuses."
+    )
+    # The report repeats the warnings of loading.
+    parser.set_defaults(run=_inspect, log_level=logging.ERROR)
+    add_robot(parser, scenes=True)
+    add_vector(parser, "q", "configuration of the report [rad or m]; default: 0")
+    add_vector(parser, "v", "velocity of the report [rad/s or m/s]; default: 0")
+    add_gravity(parser)
+
+
+def _inspect(request: argparse.Namespace, _errors: Console) -> int:
+    if names_scene(request.robot):
+        file = scene_file(request, request.robot)
+        rows = [("robot", file.robot.name), *file.required.rows]
+        rows.append(("horizon", f"{file.steps} steps of {file.dt:g} s, {file.integrator}"))
+        show(Table(f"{file.title} ({file.path.name})", (), rows))
+        return 0
+    values: dict[str, Any] = {name: values_of(name, getattr(request, name)) for name in ("q", "v")}
+    show(inspect_robot(request.robot, **values, gravity=request.gravity, **robot_options(request)))
+    return 0
+
+
+def add_robots(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``varpin robots``."""
+    parser.description = "List the robots with names: varpin's own, and the fixed-base ones of example-robot-data."
+    parser.set_defaults(run=_robots, log_level=logging.ERROR)
+
+
+def _robots(_request: argparse.Namespace, _errors: Console) -> int:
+    show(Table("Robots", ("name", "joints"), [(name, load_robot(name).dof) for name in robot_names()]))
+    show("joints without mimic joints; --lock locks some of them")
+    return 0
