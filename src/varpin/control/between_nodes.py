@@ -1,8 +1,8 @@
 """Constraints of a plan between its nodes: where the motion violates them, and rows that forbid it there.
 
 Rows are added at the peaks of a motion within its steps, and stay (exchange, as of semi-infinite programs). Values are
-those of the motion integrated in parts of its steps, derivatives those of the cubics through its nodes. A controller's
-ticks take the values on cubics, too, which hardly need any time.
+those of the motion integrated in parts of its steps, on parabolas through their ends, and derivatives are differences
+of these. A controller's ticks have rows on the cubics through the nodes instead, which take hardly any time.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from varpin.arrays import Floats, Integers, Mask
 from varpin.control.constraints import BoundConstraint, Horizon, PlanConstraint
 from varpin.control.problem import OptimalControlProblem
+from varpin.errors import LinearizationError
 from varpin.io.archive import Axes
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import quiet
@@ -28,6 +29,8 @@ _PARTS = 8
 _OUTSIDE = 1e-6
 # Distance in steps within which an instant is that of a peak: what it misses of it is of second order.
 _SAME = 1e-3
+# Differences of states and controls; from 1e-7 to 1e-5.
+_SHIFT = 1e-6
 # Distance of a peak from its bound up to which it gets rows, too, relative to the constraint's scale.
 _NEAR = 1e-3
 # Violation between nodes from which rows are added: where the problem asks for them, and in tenths of a constraint's
@@ -55,15 +58,36 @@ class BoundBetween(BoundConstraint):
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """See :meth:`BoundConstraint.value`; for one motion. Infinite where a step fails in parts."""
-        if self.ends is None:
-            return self.inner.value(*self._states(q, v), u)
-        steps, index = np.unique(self.places - 1, return_inverse=True)
-        parts = _in_parts(self.problem, q, v, u, steps)
+        return self.inner.value(*self._states(q, v), u) if self.ends is None else self._in_parts(self._given(q, v, u))
+
+    def _given(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """The state before each step and its controls (K, 2n + c)."""
+        begin = self.places - 1
+        return np.concatenate([q[begin], v[begin], _controls(self.problem, u, begin)], axis=1)
+
+    def _in_parts(self, given: Floats) -> Floats:
+        assert self.ends is not None
+        _, first, index = np.unique(self.places, return_index=True, return_inverse=True)
+        parts = _in_parts(self.problem, given[first])
         if parts is None:
             return np.full(self.shape, np.inf)
         within_q, within_v = (_after_first(x[index].reshape(-1, x.shape[2])) for x in parts)
-        found = self.ends.value(within_q, within_v, u)
+        found = self.ends.value(within_q, within_v, np.zeros((len(within_q), 0)))
         return _on_parabolas(found.reshape(len(self.places), -1, len(self.rows)), self.moments)
+
+    def slopes(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """Derivatives (K, rows, 2n + c) in the states where the steps begin and in their controls, by differences.
+
+        Raises:
+            LinearizationError: A step fails in parts.
+        """
+        z = self._given(q, v, u)
+        here, shifts = self._in_parts(z), _SHIFT * np.eye(z.shape[1])
+        with np.errstate(invalid="ignore"):
+            found: Floats = np.stack([self._in_parts(z + shift) - here for shift in shifts], axis=2) / _SHIFT
+        if not np.isfinite(found).all():
+            raise LinearizationError(0, 0.0, "a step fails in parts")
+        return found
 
     @property
     def _coefficients(self) -> Floats:
@@ -194,24 +218,29 @@ def followed(problem: OptimalControlProblem, instants: Instants, motion: Traject
     return Instants(np.array([item[:2] for item in found]), np.array([item[2] for item in found]))
 
 
-def _in_parts(
-    problem: OptimalControlProblem, q: Floats, v: Floats, u: Floats, steps: Integers
-) -> tuple[Floats, Floats] | None:
-    """The q and v (K, parts + 1, n) at the ends of the parts of K steps of a motion, without noise; None if one fails.
+def _controls(problem: OptimalControlProblem, u: Floats, steps: Integers) -> Floats:
+    """Controls (K, m) of steps, or (K, 2m) at both ends where they are linear, from those of all."""
+    return np.concatenate([u[steps], u[steps + 1]], axis=1) if problem.linear else u[steps]
 
-    ``u`` are the controls of all steps, or of all nodes where they are linear.
+
+def _in_parts(problem: OptimalControlProblem, given: Floats) -> tuple[Floats, Floats] | None:
+    """The q and v (K, parts + 1, n) at the ends of the parts of K steps, without noise; None if one fails.
+
+    ``given`` (K, 2n + c) are the states before the steps and their controls.
     """
-    commands = open_loop(u[steps + problem.linear])._replace(hold=_PARTS, own=1)
+    n, m = problem.scene.robot.dof, problem.scene.controls
+    q, v, u = (part.copy() for part in np.split(given, [n, 2 * n], axis=1))
+    commands = open_loop(u[:, -m:])._replace(hold=_PARTS, own=1)
     if problem.linear:
-        commands = commands._replace(before=u[steps], stage_times=np.array(problem.integrator.stage_times or (0.5,)))
-    begin = q[steps], v[steps]
+        times = np.array(problem.integrator.stage_times or (0.5,))
+        commands = commands._replace(before=u[:, :m].copy(), stage_times=times)
     try:
-        found = problem.integrator.motions(quiet(problem.scene), *begin, commands, problem.dt / _PARTS)
+        found = problem.integrator.motions(quiet(problem.scene), q, v, commands, problem.dt / _PARTS)
     except CustomForceError:
         return None
     if found is None:
         return None
-    within_q, within_v = (np.concatenate([x[:, None], inner], axis=1) for x, inner in zip(begin, found, strict=True))
+    within_q, within_v = (np.concatenate([x[:, None], inner], axis=1) for x, inner in zip((q, v), found, strict=True))
     return within_q, within_v
 
 
@@ -225,8 +254,9 @@ def _seen(problem: OptimalControlProblem, motion: Trajectory) -> dict[int, Float
 
     Minus infinity in the first step where the start violates the constraint. Empty where a step fails in parts.
     """
-    steps, u = np.arange(motion.steps), problem.control_rows(motion)
-    parts = _in_parts(problem, motion.q, motion.v, u, steps)
+    steps = np.arange(motion.steps)
+    u = _controls(problem, problem.control_rows(motion), steps)
+    parts = _in_parts(problem, np.concatenate([motion.q[:-1], motion.v[:-1], u], axis=1))
     if parts is None:
         return {}
     q, v = (_after_first(x.reshape(-1, x.shape[2])) for x in parts)

@@ -461,11 +461,17 @@ class Stages(Frozen):
             at = np.stack([layout.control(bound.places - 1)[:, columns], layout.control(bound.places)[:, columns]], 2)
             pair = np.broadcast_to(np.array([-1.0, 1.0]) / bound.period, at.shape)
             return np.concatenate([at, at], axis=1).reshape(-1, 2), np.concatenate([pair, -pair], 1).reshape(-1, 2)
-        nodes, slopes = [bound.places], [bound.jacobian(motion.q, motion.v)]
-        if isinstance(bound, BoundBetween):
-            nodes, slopes = [bound.places - 1, bound.places], bound.by_nodes(slopes[0])
-        at = np.concatenate([layout.state(k) for k in nodes], axis=1)
-        J = np.concatenate([part @ self.steps.slopes[k] for k, part in zip(nodes, slopes, strict=True)], axis=2)
+        if isinstance(bound, BoundBetween) and bound.ends is not None:
+            J = bound.slopes(motion.q, motion.v, self.steps.problem.control_rows(motion))
+            begins, x = bound.places - 1, layout.states
+            at = layout.in_stage(begins)
+            J = np.concatenate([J[:, :, :x] @ self.steps.slopes[begins], J[:, :, x:]], axis=2)
+        else:
+            nodes, slopes = [bound.places], [bound.jacobian(motion.q, motion.v)]
+            if isinstance(bound, BoundBetween):
+                nodes, slopes = [bound.places - 1, bound.places], bound.by_nodes(slopes[0])
+            at = np.concatenate([layout.state(k) for k in nodes], axis=1)
+            J = np.concatenate([part @ self.steps.slopes[k] for k, part in zip(nodes, slopes, strict=True)], axis=2)
         return np.repeat(at, len(bound.rows), axis=0), J.reshape(-1, J.shape[2])
 
     def change(self, z: Floats) -> tuple[float, float]:
