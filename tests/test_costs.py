@@ -13,7 +13,6 @@ from test_sddp import SAMPLINGS, run, sliders, small
 
 import varpin as vp
 from varpin.control.costs import Points
-from varpin.core import CostTerms, Subject
 from varpin.model.kinematics import frame_kinematics
 
 N, CONTROLS = 7, 3
@@ -189,28 +188,6 @@ def test_manipulability_where_there_is_none(load):
     np.testing.assert_allclose(given.gradient[2], 0.0, atol=1e-10)
     outer = slopes[:, :, None] * slopes[:, None, :]
     np.testing.assert_allclose(given.hessian[:, :6, :6], 2.0 * outer, atol=1e-9)
-
-
-def test_terms_of_what_is_not_there_are_refused(robot, frame):
-    """By the core, which the library does not ask for them."""
-    n = robot.dof
-    costs, kinematics = CostTerms.make(n, 2), frame_kinematics(robot, frame)
-    costs.add_frame(kinematics.links.core, kinematics.rotation, kinematics.translation)
-    center = costs.add_center(kinematics.links.core)
-    for fact, subject, place, size, target, directions in (
-        ("do not exist", Subject.entries, 2 * n, 3, (1, 3), []),
-        ("do not exist", Subject.excess, 2 * n, 3, (1, 6), []),
-        ("do not exist", Subject.position, 2, 3, (1, 3), []),
-        ("wrong size", Subject.twist, 0, 3, (1, 3), []),
-        ("target has size 3", Subject.orientation, 0, 3, (1, 3), []),
-        ("no target", Subject.position, 0, 3, (0, 3), []),
-        ("has directions", Subject.manipulability, 0, 1, (1, 1), []),
-        ("has directions", Subject.position, 0, 3, (1, 3), [0]),
-        ("rows of a Jacobian", Subject.manipulability, 0, 1, (1, 1), [6]),
-        ("only a position", Subject.twist, center, 6, (1, 6), []),
-    ):
-        with refused(ValueError, fact):
-            costs.add_term(subject, place, np.eye(size), np.zeros(target), np.array(directions, dtype=np.int64))
 
 
 def tree(seed):
