@@ -22,7 +22,6 @@ MARKS = {
     "no lower cost": "no step lowers the cost",
     "unmet constraint": "cannot be met from here",
     "unmet first node": "whatever the controls within their limits",
-    "no plan from here": "no plan can be made from here",
     "no plan within constraints": "no plan within the constraints",
     "no half step": "half the step cannot be taken",
     "interruption": "interrupted",

@@ -233,9 +233,9 @@ def run(case: Case, given: object, rtol: float) -> Array:
     return np.array([case.q0 + q, v])
 
 
-def truth(case: Case, u: Array | None = None, cache: Path | None = None) -> Truth | None:
-    """The true motion, a law called with its states; or that under recorded controls u (N, m). None: unknown."""
-    given, q0, v0 = case.controls if u is None else u, case.q0, case.v0
+def truth(case: Case, cache: Path | None = None) -> Truth | None:
+    """The true motion, a law called with its states. None: unknown."""
+    given, q0, v0 = case.controls, case.q0, case.v0
     now = given.f(case.dt) if isinstance(given, vp.OpenLoop) else given(0.0, q0, v0) if callable(given) else given
     probe = [q0, v0, case.dt, case.steps, *(f(q0, v0, v0) for f in case.formulas), 0.0 if now is None else now]
     key = hashlib.sha1(np.round(np.concatenate(probe, axis=None), 9).tobytes()).hexdigest()[:12]
@@ -256,11 +256,11 @@ def truth(case: Case, u: Array | None = None, cache: Path | None = None) -> Trut
 
 class Verdict(NamedTuple):
     # "off": wrong; "right": clearly right; "untold", "told": of these, without and with a warning about the error;
-    # "loop": right and told, but of an unstable loop, or wrong with recorded controls alone; "unknown": too chaotic.
+    # "loop": right and told, but of an unstable loop; "unknown": too chaotic.
     labels: frozenset[str]
     told: tuple[str, ...] = ()  # warnings about its error
     share: tuple[float, float] = (np.nan, np.nan)  # error of q by travel, of v by speed
-    factor: float = np.nan  # estimated by true error, of a law under its recorded controls
+    factor: float = np.nan  # estimated by true error
     seconds: tuple[float, float] = (0.0, 0.0)  # without and with the check
 
     def __str__(self) -> str:
@@ -268,30 +268,27 @@ class Verdict(NamedTuple):
         return f"q {q}, v {v}, factor {self.factor:.3g} {[text[:150] for text in self.told]}"
 
 
-def judge(case: Case, motion: vp.Trajectory, real: Truth | None, held: Truth | None = None) -> Verdict:
-    """Compare a motion with the truth; ``held`` is that under the recorded controls of a law."""
+def judge(case: Case, motion: vp.Trajectory, real: Truth | None) -> Verdict:
+    """Compare a motion with the truth."""
     said = [str(one) for one in motion.warnings if getattr(one, "kind", "") not in NO_ERRORS]
     told = tuple(text for text in said if not any(word in text for word in WORDS))
     if real is None:
         return Verdict(frozenset({"unknown"}), told)
-    (states, doubt), (alone, doubt_alone) = real, real if held is None else held
+    states, doubt = real
     size = np.array([np.ptp(states[0], axis=0), np.abs(states[1]).max(axis=0)])
     for alike in (case.scene.robot.slides, ~case.scene.robot.slides):
         size[:, alike] = size[:, alike].max(axis=1, initial=1e-6, keepdims=True)
-    off, alone = (np.abs(np.array([motion.q, motion.v]) - its).max(axis=1) for its in (states, alone))
-    share, doubt = (off / size).max(axis=1), (doubt / size).max(axis=1)
-    loop = all("control l" in text for text in told) or not ((alone / size).max(axis=1) < RIGHT).all()
+    off = np.abs(np.array([motion.q, motion.v]) - states).max(axis=1)
+    least, share, doubt = max(1e-8, 5.0 * doubt[0].max()), (off / size).max(axis=1), (doubt / size).max(axis=1)
+    loop = all("control l" in text for text in told)
+    loop = all("control l" in text for text in told)
     right = (share < RIGHT).all() and (doubt < 0.2 * RIGHT).all()
     labels = {"right", *(["loop" if loop else "told"] if told else [])} if right else set()
     for limit, after in ((WRONG, ""), (STRICT, " 1%")):
         labels |= {f"off{after}", *([] if told else [f"untold{after}"])} if (share > limit).any() else set()
-    estimate, true, factor = getattr(motion, "error", None), alone[0].max(), np.nan
-    # The check gives that under the law where the recorded controls alone lead far off.
-    true = (
-        off[0].max() if held is not None and right and not told and not (alone[0] / size[0]).max() < RIGHT[0] else true
-    )
-    if estimate is not None and true > max(1e-8, 5.0 * doubt_alone[0].max()):
-        factor = float(np.max(estimate) / true)
+    estimate, factor = getattr(motion, "error", None), np.nan
+    if estimate is not None and off[0].max() > least:
+        factor = float(np.max(estimate) / off[0].max())
     return Verdict(frozenset(labels if (doubt < 0.2 * WRONG).all() else {"unknown"}), told, tuple(share), factor)
 
 
@@ -302,9 +299,7 @@ def verdict_of(seed: int, cache: Path | None = None) -> tuple[Case, Verdict]:
         runs = [timeit.repeat(lambda on=on: case.simulate(on), number=1, repeat=2) for on in (False, True)]
     except vp.StepFailure as error:
         return case, Verdict(frozenset({"failed"}), (str(error),))
-    real = truth(case, cache=cache)
-    held = truth(case, motion.u, cache) if callable(case.controls) else real
-    return case, judge(case, motion, held and real, held)._replace(seconds=tuple(map(min, runs)))
+    return case, judge(case, motion, truth(case, cache))._replace(seconds=tuple(map(min, runs)))
 
 
 def main() -> None:

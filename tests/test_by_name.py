@@ -62,7 +62,7 @@ def test_names_and_numbers_that_are_none_are_named(call):
     with refused(vp.UnknownJoint, "'elbow'", "'elbow_joint'") as caught:
         call({"elbow": 1.0})
     assert caught.value.matches[0] == "elbow_joint"
-    assert caught.value.joints == NAMES
+    assert caught.value.known == NAMES
     for value, facts in ((np.nan, ("'elbow_joint'", "nan")), ("a", "'a'")):
         with refused(vp.InputError, facts):
             call({"elbow_joint": value})

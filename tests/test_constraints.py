@@ -3,39 +3,25 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from oracles import Mechanism
+import zoo
+from oracles import Mechanism, slope
 from refusals import refused, unnamed
 from scipy.optimize import minimize
 
 import varpin as vp
 from varpin.mechanics.assembly import along_constraints
 
-LOOPS = {
-    # Links of 1 m; the ground closes the loop.
-    "four-bar": (3, [vp.PointOnPoint("tip", (1.3, 0.0, 0.2), axes="xz")], [-1.5, 1.5, 1.5]),
-    "five-bar": (4, [vp.PointOnPoint("tip", (1.6, 0.0, 0.3), axes="xz")], [-1.0, 1.0, 1.0, 1.0]),
-}
-
-
-WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
-
 
 def central(f, x, size=1e-3):
-    """Derivative of f in each entry of x, of eighth order, along the first axis."""
-    return np.array(
-        [
-            sum(w * (f(x + k * size * d) - f(x - k * size * d)) for k, w in WEIGHTS.items()) / size
-            for d in np.eye(x.size)
-        ]
-    )
+    """Derivative of f in each entry of x, along the first axis."""
+    return np.array([slope(f, x, d, size) for d in np.eye(x.size)])
 
 
 def loop(name, **options):
-    """A scene with a loop, and a state in it."""
-    links, constraints, q = LOOPS[name]
-    scene = vp.Scene(vp.planar_chain(links), constraints=constraints, **options)
-    q = vp.assemble(scene, q)
-    return scene, q, along_constraints(scene, q, np.array([1.0, 0.0, 0.0, 2.0][:links]))
+    """A scene with a loop of the zoo, and a state in it."""
+    case = zoo.ZOO[name]
+    scene = vp.Scene(case.scene.robot, constraints=case.scene.constraints, **options)
+    return scene, case.q0, along_constraints(scene, case.q0, np.array([1.0, 0.0, 0.0, 2.0][: case.q0.size]))
 
 
 def violations(scene, trajectory):
@@ -160,14 +146,11 @@ def test_forces_are_those_of_the_index_reduced_equations():
     np.testing.assert_allclose(motion.constraint_forces[0], force, atol=1e-4 * np.abs(force).max())
 
 
-@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)])
-def test_a_long_motion_stays_on_the_constraints_and_keeps_its_energy(integrator):
-    steps = 100_000
+@pytest.mark.parametrize("steps", [20_000, pytest.param(200_000, marks=pytest.mark.slow)])
+def test_a_long_motion_stays_on_the_constraints_and_keeps_its_energy(steps):
     scene, q, v = loop("four-bar")
-    motion = vp.simulate(scene, q, v, dt=2e-3, steps=steps, integrator=integrator, check=False)
-    g, rate = violations(scene, motion)
-    assert g < 1e-12
-    assert rate < 1e-12
+    motion = vp.simulate(scene, q, v, dt=2e-3, steps=steps, check=False, integrator=vp.Midpoint())
+    assert max(violations(scene, motion)) < 1e-12
     off = motion.energy - motion.energy[0]
     first, second = off[: steps // 2], off[steps // 2 :]
     assert abs(second.mean() - first.mean()) < 0.05 * np.abs(off).max()
@@ -248,10 +231,6 @@ def test_a_start_next_to_the_constraints_is_moved_onto_them(caplog):
     assert not unnamed(said, "q0", "v0")
     assert said in caplog.text
     assert vp.simulate(scene, q, v, dt=1e-2, steps=2).warnings == ()
-
-
-def test_a_start_far_from_the_constraints_is_refused():
-    scene, q, _ = loop("five-bar")
     with refused(vp.InputError, "q0", "PointOnPoint", "assemble"):
         vp.simulate(scene, q + 0.1, 0.0 * q, dt=1e-2, steps=2)
 
@@ -459,24 +438,12 @@ def test_a_check_of_the_linearization(integrator, monkeypatch):
     assert not vp.check_linearization(scene, q, v, u, **options).holds
 
 
-def test_motions_keep_forces_and_the_constraints_they_were_made_under(tmp_path):
+def test_forces_of_a_part_of_a_motion():
     scene, q, v = loop("five-bar")
     motion = vp.simulate(scene, q, v, dt=1e-2, steps=7)
-    assert motion.constraint_forces.shape == (7, 2)
+    np.testing.assert_array_equal(motion.part(2, 5).constraint_forces, motion.constraint_forces[2:5])
     assert motion.constraint_labels == scene.constraint_labels
-    assert motion.part(2, 5).constraint_forces.shape == (3, 2)
-    read = vp.Trajectory.load(motion.save(tmp_path / "motion.npz"), scene.robot)
-    np.testing.assert_array_equal(read.constraint_forces, motion.constraint_forces)
-    assert read.constraint_labels == motion.constraint_labels
-    np.testing.assert_array_equal(vp.linearize(scene, read).A, vp.linearize(scene, motion).A)
-    other = vp.Scene(scene.robot, constraints=vp.PointOnPoint("tip", (1.6, 0.0, 0.301), axes="xz"))
-    for wrong in (other, vp.Scene(scene.robot)):
-        with refused(vp.InputError, "constraints"):
-            vp.linearize(wrong, motion)
-    free = vp.simulate(vp.Scene(scene.robot), q, v, dt=1e-2, steps=2)
-    assert free.constraint_forces.shape == (2, 0)
-    with refused(vp.InputError, "constraints"):
-        vp.linearize(scene, free)
+    assert vp.simulate(vp.Scene(scene.robot), q, v, dt=1e-2, steps=2).constraint_forces.shape == (2, 0)
 
 
 def test_rows_keep_the_order_they_are_given_in():
@@ -497,39 +464,21 @@ def test_rows_keep_the_order_they_are_given_in():
 
 
 def test_scene_files_have_constraints(tmp_path):
-    text = """
-[robot]
-source = "ur5"
-[[constraint]]
-type = "point_on_point"
-a = { frame = "tool0", place = [0.0, 0.0, 0.1] }
-b = [0.3, 0.2, 0.4]
-axes = "xz"
-[[constraint]]
-type = "joint_tie"
-joint = "wrist_3_joint"
-leader = "wrist_2_joint"
-coefficients = [0.1, -2.0]
-[horizon]
-dt = 2e-3
-steps = 10
-"""
-    constraints = [
-        vp.PointOnPoint(("tool0", [0.0, 0.0, 0.1]), [0.3, 0.2, 0.4], axes="xz"),
-        vp.JointTie("wrist_3_joint", "wrist_2_joint", [0.1, -2.0]),
-    ]
     path = tmp_path / "loop.toml"
+    text = (
+        '[robot]\nsource = "ur5"\n[[constraint]]\ntype = "point_on_point"\n'
+        'a = { frame = "tool0", place = [0.0, 0.0, 0.1] }\nb = [0.3, 0.2, 0.4]\naxes = "xz"\n'
+        "[horizon]\ndt = 2e-3\nsteps = 10\n"
+    )
     path.write_text(text)
-    file = vp.load_scene(path)
-    scene = vp.Scene(vp.load_robot("ur5"), constraints=constraints)
-    assert file.required.terms["constraints"] == "PointOnPoint, JointTie"
-    assert file.scene.bound_constraints == scene.bound_constraints
+    file, own = vp.load_scene(path), vp.PointOnPoint(("tool0", [0.0, 0.0, 0.1]), [0.3, 0.2, 0.4], axes="xz")
+    assert file.scene.bound_constraints == vp.Scene(vp.load_robot("ur5"), constraints=own).bound_constraints
+    assert file.required.terms["constraints"] == "PointOnPoint"
     with refused(vp.SceneFileError, "loop.toml", "initial.q", "q0", "assemble"):
         file.simulate()
     for change, facts in (
         (("tool0", "tol0"), ("constraint[0]", "'tol0'")),
-        (("wrist_3_joint", "wrist_4_joint"), ("constraint[1]", "'wrist_4_joint'")),
-        (('"joint_tie"', '"rod"'), "constraint[1].type"),
+        (("point_on_point", "rod"), "constraint[0].type"),
         (("axes", "axis"), "constraint[0].axis"),
     ):
         path.write_text(text.replace(*change))
@@ -543,7 +492,7 @@ def test_a_function_gets_angles_with_their_whole_turns():
     q = vp.assemble(vp.Scene(robot, constraints=on_a_line), [2.0 * np.pi + 0.5, 2.0])
     forces = vp.CustomForce(lambda q, v: -5.0 * q), vp.JointSpring(5.0)
     scenes = [vp.Scene(robot, constraints=on_a_line, forces=[force]) for force in forces]
-    motions = [vp.simulate(scene, q, [0, 0], dt=1e-3, steps=200, integrator=vp.Gauss(2)) for scene in scenes]
+    motions = [vp.simulate(scene, q, [0, 0], dt=1e-2, steps=20, integrator=vp.Gauss(2)) for scene in scenes]
     np.testing.assert_allclose(motions[0].q, motions[1].q, atol=1e-9)
 
 

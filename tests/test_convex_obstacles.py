@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from chromium import commands
+from chromium import animation, commands
 from refusals import refused
 from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
@@ -14,7 +14,6 @@ import varpin as vp
 from varpin import replay
 from varpin.model.clearance import clearance
 from varpin.model.kinematics import frame_kinematics
-from varpin.show.replay.annotations import regions
 
 ARM = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05), "joint2": ([0, 0, 0], [1, 0, 0], 0.05)}
 CUBE = np.array(list(product([-0.5, 0.5], repeat=3)))
@@ -174,24 +173,23 @@ def test_drawn_where_it_is(tmp_path):
     """Its corners in the world, over its way, in the page, and its triangles closed and facing outwards."""
     hull = vp.Obstacle.convex(WEDGE, [0.5, 0.1, 0.2], TURN).moving(lambda t: [t, 0.0, 0.0])
     problem = around(hull)
-    (region,) = regions(problem.constraints, np.array([0.0, 1.0]))
     known = WEDGE @ TURN.T + [0.5, 0.1, 0.2]
-    np.testing.assert_allclose(region.around(None).min(axis=0), known.min(axis=0), atol=1e-12)
-    np.testing.assert_allclose(region.around(None).max(axis=0), known.max(axis=0) + np.eye(3)[0], atol=1e-12)
-    a, b, c = (region.hull.points[region.hull.faces[:, k]] for k in range(3))
-    # The divergence theorem: the volume within the triangles.
-    volume = (a * np.cross(b, c)).sum() / 6.0
-    assert volume == pytest.approx(0.5 * 0.4 * 0.25 * 0.3, rel=1e-12)
     page = replay(
         problem.scene.robot, np.zeros((2, 2)), dt=1.0, marks=vp.Marks(constraints=problem), html=tmp_path / "wedge.html"
     )
     drawn, placed = (
         command for command in commands(page) if command.get("path", "").endswith("notes/0 obstacle convex")
     )
-    corners = drawn["object"]["geometries"][0]["data"]["attributes"]["position"]["array"].data
-    R, at = np.split(np.array(placed["matrix"]).reshape(4, 4).T[:3], [3], axis=1)
-    seen = np.frombuffer(corners, dtype=np.float32).reshape(-1, 3) @ R.T + at[:, 0]
+    data = drawn["object"]["geometries"][0]["data"]
+    at = np.array(placed["matrix"]).reshape(4, 4).T[:3, 3]
+    seen = np.frombuffer(data["attributes"]["position"]["array"].data, dtype=np.float32).reshape(-1, 3) + at
     np.testing.assert_allclose(np.sort(seen, axis=0), np.sort(known, axis=0), atol=1e-6)
+    faces = np.frombuffer(data["index"]["array"].data, dtype=np.uint32).reshape(-1, 3)
+    a, b, c = (seen[faces[:, k]] for k in range(3))
+    # The divergence theorem: the volume within the triangles.
+    assert (a * np.cross(b, c)).sum() / 6.0 == pytest.approx(0.5 * 0.4 * 0.25 * 0.3, rel=1e-5)
+    (track,) = [values for (path, _), (_, values) in animation(page)[0].items() if "notes" in path]
+    np.testing.assert_allclose(np.diff(track, axis=0), [[1.0, 0.0, 0.0]], atol=1e-6)
 
 
 SCENE = """

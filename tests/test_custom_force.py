@@ -2,7 +2,6 @@
 
 import gc
 import itertools
-import pickle
 import weakref
 
 import numpy as np
@@ -37,21 +36,6 @@ def scene(**options):
 def simulate(own, **options):
     given = {"dt": 0.01, "steps": 5, "controls": [1.0, 0.5, -0.2], "check": False}
     return vp.simulate(own, Q0, V0, **(given | options))
-
-
-class TestSteps:
-    def test_a_joint_that_goes_round_is_told_how_often(self):
-        seen = []
-        wheel = vp.planar_chain(1)
-
-        def wind(q, v):
-            seen.append(float(q[0]))
-            return -0.01 * q
-
-        own = vp.Scene(wheel, gravity=False, forces=vp.CustomForce(wind))
-        motion = vp.simulate(own, [0.0], [30.0], dt=0.01, steps=100, check=False)
-        assert motion.q[-1, 0] > 4.0 * np.pi
-        assert max(seen) == pytest.approx(motion.q[-1, 0], abs=0.5)
 
 
 class TestDerivatives:
@@ -103,19 +87,9 @@ class TestRefused:
 
 def test_shown():
     assert repr(vp.CustomForce(drag, "complex")) == "CustomForce(drag, derivatives by complex steps)"
-    assert "CustomForce" in repr(scene())
 
 
-def test_a_motion_under_a_function_is_not_linearized_without_one():
-    robot = vp.planar_chain(2)
-    scene = vp.Scene(robot, forces=[vp.CustomForce(lambda q, v: -5.0 * v)])
-    motion = vp.simulate(scene, [0.3, 0.2], [0.0, 0.0], dt=1e-3, steps=5)
-    vp.linearize(scene, motion)
-    with refused(vp.InputError, "scene"):
-        vp.linearize(vp.Scene(robot), motion)
-
-
-@pytest.mark.parametrize("most", [0.2, 0.3, 0.4, 0.5])
+@pytest.mark.parametrize("most", [0.2, 0.4])
 def test_all_steps_before_a_function_that_raises_are_kept_under_linear_controls(most):
     def drag(q, v):
         if abs(v[0]) > most:
@@ -234,16 +208,6 @@ class TestWhereItFails:
 
         motion = vp.simulate(vp.Scene(ROBOT, forces=vp.CustomForce(edge, damps)), Q0, V0, duration=0.1, tolerance=1e-5)
         assert motion.accuracy.met
-
-    def test_in_an_ensemble(self):
-        with refused(vp.ForceError, "path 0", "CustomForce breaks") as info:
-            vp.simulate_ensemble(
-                self.own(noise=vp.AdditiveNoise(0.01)), Q0, V0, dt=0.01, steps=30, paths=4, rng=0, workers=2
-            )
-        self.check(info.value)
-        again = pickle.loads(pickle.dumps(info.value))
-        assert str(again) == str(info.value)
-        assert again.step == info.value.step
 
     def test_in_a_plan(self):
         """On the first motion it is an error; later on it costs trials."""

@@ -10,17 +10,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from refusals import refused
 
 import varpin as vp
 from varpin.cli import command
 from varpin.core import coupling_kinds, element_kinds
-from varpin.core.arrays import Carried, ConstraintRows, Coupling, Diffusion, Element, Product, Tied
+from varpin.core.arrays import Carried, ConstraintRows, Diffusion, Product
 from varpin.integrators import registry
 from varpin.integrators.collocation import Collocation
 from varpin.integrators.tableau import midpoint
 from varpin.io.scenefile.kinds import CONSTRAINTS
-from varpin.mechanics import constraints, forces
+from varpin.mechanics import constraints
 from varpin.mechanics.forces import point_of
 from varpin.mechanics.noise import BoundNoise
 
@@ -181,53 +180,6 @@ def test_a_force_of_the_core_is_a_struct_and_its_name(tmp_path):
         text=True,
     )
     assert done.returncode == 0, done.stderr
-
-
-def bound_to(base, returned):
-    """A force or constraint whose ``bind`` returns what it is told."""
-    return type("Own", (base,), {"bind": lambda self, robot: returned})()
-
-
-@pytest.mark.parametrize(
-    ("returned", "facts"),
-    [
-        ((Element("Nope", 0, (1.0,)),), ("'Nope'", "JointDamper")),
-        ((Element("JointDamper", 2, (1.0,)),), ("coordinate", "JointDamper", "2")),
-        ((Element("Armature", -1, (1.0,)),), ("coordinate", "Armature", "-1")),
-        ((Element("JointDamper", 0.5, (1.0,)),), ("coordinate", "0.5")),
-        ((Element("JointDamper", 0, (1.0, 2.0)),), ("JointDamper", "1 values")),
-        ((Element("JointDamper", 0, (np.nan,)),), ("JointDamper", "NaN")),
-        ((Coupling("FrameLoad", 0, 2, (0.0,) * 9),), ("a=0", "FrameLoad", "its b", "2")),
-        ((Coupling("FrameLoad", 0, -2, (0.0,) * 9),), ("FrameLoad", "its b", "-2")),
-        ((Coupling("FrameLoad", 0, 1, (0.0,) * 3),), ("FrameLoad", "9 values")),
-        ((Coupling("JointDamper", 0, 1, (0.0,) * 7),), ("'JointDamper'", "FrameLoad")),
-        ((1.0,), ("1.0", "Element", "Coupling")),
-    ],
-)
-def test_elements_that_the_core_cannot_take_are_refused_by_name(returned, facts):
-    with refused(vp.InputError, "Own.bind", facts):
-        vp.Scene(vp.planar_chain(2), forces=bound_to(forces.Force, returned))
-
-
-POINT = (Carried(0, False, (0.0, 0.0, 0.0)),)
-
-
-@pytest.mark.parametrize(
-    ("rows", "labels", "aligned", "facts"),
-    [
-        (ConstraintRows(((Carried(2, False, (0.0, 0.0, 0.0)),),), (Product(0, 0, 1.0, 1.0),)), 1, (), ("body", "2")),
-        (ConstraintRows((POINT,), (Product(0, 1, 1.0, 1.0),)), 1, (), ("Product", "its y", "1")),
-        (ConstraintRows((POINT,), (Product(-1, 0, 1.0, 1.0),)), 1, (), ("Product", "its x", "-1")),
-        (ConstraintRows(ties=(Tied(0, 2, (1.0,)),)), 1, (), ("Tied", "its leader", "2")),
-        (ConstraintRows(ties=(Tied(-1, 1, (1.0,)),)), 1, (), ("Tied", "its follower", "-1")),
-        (ConstraintRows(ties=(Tied(0, 1, (1.0,)),)), 2, (), ("2 labels", "1 rows")),
-        (ConstraintRows((POINT,), (Product(0, 0, 1.0, 1.0),)), 1, ((0, 1),), ("its y", "1")),
-    ],
-)
-def test_rows_that_the_core_cannot_take_are_refused_by_name(rows, labels, aligned, facts):
-    own = bound_to(constraints.Constraint, constraints.Bound(rows, ("row",) * labels, aligned))
-    with refused(vp.InputError, "Own.bind", facts):
-        vp.Scene(vp.planar_chain(2), constraints=own)
 
 
 def test_the_page_names_files_that_are_there():

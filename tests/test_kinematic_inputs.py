@@ -108,7 +108,6 @@ def test_a_plan_by_hand_holds_on_the_continuous_system(interpolation, dt, steps)
         np.testing.assert_allclose(motion.v[1:, 0], u[:, 1], atol=1e-9)
     told = plan.verify(tolerance=1e-5)
     assert abs(told.closed_loop_loss) < 2e-3
-    assert told.defect < 1e-4
     assert np.abs(motion.q[-1] - goal).max() < 0.01
     options = {"dt": dt, "steps": steps, "integrator": problem.integrator}
     again = vp.simulate(problem.scene, problem.q0, np.zeros(2), controls=plan.policy, **options)

@@ -141,7 +141,7 @@ def test_an_unstable_loop_that_clips_is_told(n, period, kp, kd, limit, gravity):
     assert not told(run(scene, np.zeros(n), np.zeros(n), pd(50.0, 0.1 / period, 1.0, limit), dt=period / 2, steps=298))
 
 
-def test_the_count_of_changes():
+def test_the_count_of_turns():
     motion = run(ROD, [0.0], [0.5], lambda t, q, v: -5.0 * np.sign(v), dt=1e-2, steps=300)
     (finding,) = unstable_loop(ROD, motion)
     assert finding.value > 290
@@ -174,7 +174,9 @@ def swing_up(t, q, v):
 
 TWO = vp.Scene(vp.planar_chain(2))
 ONE_OF_TWO = vp.Scene(vp.planar_chain(2), actuation=[[1.0], [0.0]])
+NOISE = np.random.default_rng(0).normal(size=701)
 STABLE = {
+    "noise of sensors": (ROD, 1, lambda t, q, v: -100 * (q - 1) - 10 * v + NOISE[round(t / 2e-3)]),
     "clipped, goal that swings": (ROD, 0, lambda t, q, v: np.clip(-1e3 * (q - 3 * np.sin(6 * t)) - 50 * v, -10, 10)),
     "clipped, goal that jumps": (ROD, 0, lambda t, q, v: np.clip(-300 * (q - np.sign(np.sin(9 * t))) - 20 * v, -5, 5)),
     "bang-bang plan": (ROD, 0, lambda t, q, v: 10.0 * np.sign(np.sin(9.0 * t)) * np.ones(1)),
@@ -195,6 +197,9 @@ UNSTABLE = {
     "one joint of two, too fast": (ONE_OF_TWO, 0, lambda t, q, v: -100 * (q[:1] - 1) - 1000 * v[:1]),
     "moving goal": (TWO, 0, lambda t, q, v: -300 * (q - np.sin(3 * t)) - 300 * v),
     "near its goal": (ROD, 1 + 1e-6, pd(1e3, 340.0)),
+    "limits that move": (ROD, 0, lambda t, q, v: (2 + np.sin(t)) * np.clip(-100 * (q - 1) - 400 * v, -5, 5)),
+    "at the end alone": (ROD, 0, lambda t, q, v: np.clip(-100 * (q - 1) - (500 if t > 1.3 else 10) * v, -5, 5)),
+    "for a time": (ROD, 0, lambda t, q, v: np.clip(-500 * (q - t) - (9e3 if 0.5 < t < 0.53 else 25) * (v - 1), -5, 5)),
     "nonlinear": (ROD, 0, lambda t, q, v: 400.0 * np.sin(-0.1 * (q - 1) - 1.0 * v)),
 }  # fmt: skip
 

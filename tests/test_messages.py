@@ -87,8 +87,7 @@ CASES = {
     ),
     vp.UnknownPosture: (
         lambda _: CHAIN.posture("home"),
-        "robot 'chain2' has no posture 'home'; it has none: give the SRDF file that has them, "
-        "load_robot(..., srdf=path), or srdf under [robot] in a scene file",
+        "robot 'chain2' has no posture 'home'; postures, from load_robot(..., srdf=path): none",
     ),
     vp.AssemblyError: (
         lambda _: vp.assemble(vp.Scene(CHAIN, constraints=AWAY), [0.1, 0.2]),

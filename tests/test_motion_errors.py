@@ -27,8 +27,7 @@ def judged(seed):
     """The motion of a seed, its true motion, and the verdict on it."""
     case = draw(seed)
     motion, real = case.simulate(), truth(case)
-    held = truth(case, motion.u) if callable(case.controls) else real
-    return case, motion, real, judge(case, motion, held and real, held)
+    return case, motion, real, judge(case, motion, real)
 
 
 @pytest.mark.parametrize("seed", [*WRONG_MOTIONS, *HARD_MOTIONS, *MISSED_BLOWS])

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from findings import about
 from mechanisms import slider
-from refusals import refused, unnamed
+from plan_problems import CAPSULES, TWO
+from refusals import naming, refused, unnamed
 
 import varpin as vp
 import varpin.control.mpc
@@ -16,6 +17,10 @@ def cart(steps=40, **options):
     return vp.OptimalControlProblem(
         vp.Scene(slider(), stiffness=3.0, gravity=False), cost, [1.0], [0.3], dt=0.05, steps=steps, **options
     )
+
+
+def target(t):
+    return [0.8 * np.sin(1.5 * t), 0.4]
 
 
 def wave(t):
@@ -75,23 +80,7 @@ def test_references_are_those_of_the_plants_time():
     assert moved.cost_of(motion) == pytest.approx(0.02 * own.sum(), rel=1e-12)
 
 
-@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.SemiImplicitEuler()], ids=str)
-def test_it_follows_a_target_on_another_plant(integrator):
-    """Wrong masses, friction unknown to it, noise, another integrator."""
-    mpc = vp.Mpc(tracking(integrator), iterations=1)
-    heavier = vp.load_robot(vp.planar_chain(3).model, payload=vp.Payload("tip", mass=0.1))
-    plant = vp.Plant(vp.Scene(heavier, damping=0.4, noise=vp.AdditiveNoise(0.05)))
-    run = mpc.run(plant, duration=1.0, rng=3)
-    error = run.motion.q - [wave(t) for t in run.motion.t]
-    assert np.abs(error[200:]).max() < 0.05
-    again = mpc.run(plant, duration=1.0, rng=3)
-    np.testing.assert_array_equal(run.motion.q, again.motion.q)
-    assert (run.iterations[1:] <= 1).all()
-    assert not run.late.any()
-
-
-@pytest.mark.parametrize("within", [False, True])
-def test_ctrl_c_ends_a_run_while_it_plans(within):
+def test_ctrl_c_ends_a_run_while_it_plans():
     """A search ends with its best plan, and the run ends with it: without a motion in the first plan."""
     robot, calls, last = vp.planar_chain(1), [], [np.inf]
 
@@ -102,10 +91,15 @@ def test_ctrl_c_ends_a_run_while_it_plans(within):
             raise KeyboardInterrupt
         return (q[:, 0] - 1.0) ** 2
 
-    limits = [vp.WithinVelocityLimits(robot, (-0.5, 0.5))] if within else []
     cost = vp.CustomCost(interrupted, name="goal") + vp.ControlCost(1e-2)
     problem = vp.OptimalControlProblem(
-        vp.Scene(robot, gravity=False), cost, [0.0], [0.0], dt=0.05, steps=6, constraints=limits
+        vp.Scene(robot, gravity=False),
+        cost,
+        [0.0],
+        [0.0],
+        dt=0.05,
+        steps=6,
+        constraints=vp.WithinVelocityLimits(robot, (-0.5, 0.5)),
     )
     controller = vp.Mpc(problem, iterations=2)
     last[0] = 4
@@ -134,8 +128,8 @@ def test_a_plant_that_fails_keeps_the_motion():
 
 
 @pytest.mark.parametrize("controls", ["held", "linear"])
-def test_a_run_ends_where_its_last_plan_does(controls):
-    """If no search finds another one, in time or at all: with all of the plan's decisions, or lines, behind it."""
+def test_a_plan_that_has_no_successor_acts_to_its_end_and_is_held_there(controls):
+    """With the feedback of its last decision, or on its last state; the run tells from when on."""
     usual, done = cart(steps=8), []
 
     def field(q, v, u):
@@ -144,45 +138,41 @@ def test_a_run_ends_where_its_last_plan_does(controls):
         return 1e-3 * np.eye(1)
 
     scene = vp.Scene(slider(), stiffness=3.0, gravity=False, noise=vp.CustomNoise(field, 1))
-    given = {"dt": usual.dt, "steps": 8, "controls": controls}
-    failing = vp.OptimalControlProblem(scene, usual.cost, usual.q0, usual.v0, **given)
+    failing = vp.OptimalControlProblem(scene, usual.cost, usual.q0, usual.v0, dt=usual.dt, steps=8, controls=controls)
     for mpc, kind in ((vp.Mpc(failing), "failed ticks"), (vp.Mpc(failing, budget=1e-9), "late plans")):
         done.clear()
-        with pytest.raises(vp.StepFailure) as caught:
-            mpc.run(vp.Plant(usual.scene), duration=2.0, progress=lambda tick, _: done.append(tick))
-        assert about(str(caught.value), "no plan from here")
-        assert caught.value.trajectory.t[-1] == pytest.approx(8 * usual.dt)
-        assert caught.value.step == caught.value.trajectory.steps
-        # The motion tells of all ticks before, which acted on the first plan.
-        (told,) = about(caught.value.trajectory.warnings, kind)
-        assert "in 8 of 8 ticks" in told
+        run = mpc.run(vp.Plant(usual.scene), duration=2.0, progress=lambda tick, _: done.append(tick))
+        (told,) = about(run.warnings, kind)
+        assert "in 39 of 39 ticks" in told
+        assert naming(run.warnings, "whole horizon", "t = 0.4 s")
+        policy, motion, end = run.plans[0].policy_on("velocity"), run.motion, run.plans[0].trajectory
+        row, reference = 7, policy.reference[7]
+        if controls == "linear":
+            row, reference = 4, np.append(end.q[-1], end.v[-1])
+        held = policy.u[7] + policy.gains[row] @ (np.append(motion.q[120], motion.v[120]) - reference)
+        found = motion.u[129]
+        if controls == "linear":
+            # Steps have the means of the line over the tick, which begins where the one before ended.
+            begin, found = (1.5 * motion.u[k - 1] - 0.5 * motion.u[k - 2] for k in (120, 130))
+            held = held + policy.previous_gains[row] @ (begin - policy.u[7])
+        np.testing.assert_allclose(found, held, rtol=0, atol=1e-9)
+        assert np.abs(run.motion.q[-1]).max() < 1.5
 
 
-@pytest.mark.parametrize("whose", ["cost", "reference"])
-def test_a_cost_that_fails_keeps_the_motion_of_all_ticks_before(whose):
+def test_a_cost_that_fails_keeps_the_motion_of_all_ticks_before():
     """In the plan of the tick whose horizon first reaches beyond 0.5 s."""
-
-    def goal(t):
-        return [0.0 if t <= 0.51 else np.nan]
-
-    def far(t, q, v, u):
-        return np.where(t <= 0.51, q[:, 0] ** 2, np.nan)
-
-    broken = vp.TrackingCost(goal) if whose == "reference" else vp.CustomCost(far)
     usual = cart(steps=8)
-    whole = vp.Mpc(usual.at(t0=0.0), iterations=1).run(duration=0.2)
-    problem = vp.OptimalControlProblem(
-        usual.scene, usual.cost + broken, usual.q0, usual.v0, dt=usual.dt, steps=usual.steps
-    )
+    whole = vp.Mpc(usual.at(cost=usual.cost + vp.TrackingCost([0.0])), iterations=1).run(duration=0.3)
+    broken = vp.TrackingCost(lambda t: [0.0 if t <= 0.51 else np.nan])
     with pytest.raises(vp.CostError) as caught:
-        vp.Mpc(problem, iterations=1).run(duration=0.5)
-    motion = caught.value.trajectory
+        vp.Mpc(usual.at(cost=usual.cost + broken), iterations=1).run(duration=0.5)
+    motion, cause = caught.value.trajectory, caught.value.__cause__
     assert motion.steps == 30
-    assert motion.q[0] == whole.motion.q[0]
+    np.testing.assert_allclose(motion.q, whole.motion.q[:31], rtol=0, atol=1e-12)
     assert not unnamed(str(caught.value), "error.trajectory")
-    assert isinstance(caught.value.__cause__, vp.CostError)
-    assert caught.value.__cause__.trajectory is None
-    assert caught.value.cost == caught.value.__cause__.cost
+    assert isinstance(cause, vp.CostError)
+    assert cause.trajectory is None
+    assert caught.value.cost == cause.cost
 
 
 @pytest.mark.parametrize(("slow", "told"), [(20, True), (3, True), (1, False), (0, False)])
@@ -247,14 +237,10 @@ def test_what_plan_and_motion_have_in_common_is_told_once():
     assert [f"the first plan: {sentence}" for sentence in first] == about(short.warnings, "velocity limits")
 
 
-def path(t):
-    return [0.3 * np.sin(t), 0.2 * t]
-
-
 @pytest.mark.parametrize(
     "cost",
     [
-        vp.TrackingCost(path, 2.0) + vp.Terminal(vp.TrackingCost(path)),
+        vp.TrackingCost(target, 2.0) + vp.Terminal(vp.TrackingCost(target)),
         vp.TrackingCost(np.linspace([0.0, 0.0], [1.0, 2.0], 21)) + 2.0 * vp.VelocityCost(0.1),
         vp.CustomCost(lambda t, q, v, u: t * (q**2).sum(axis=-1)) + vp.ControlRateCost(0.1, [0.1, 0.2]),
         vp.Terminal(vp.FramePositionCost(vp.planar_chain(2), "tip", lambda t: [t, 0.0, 1.0])),
@@ -303,10 +289,7 @@ def test_a_tick_with_linear_controls_is_its_problem_solved_anew(rate):
     """Measured elsewhere than planned: enough iterations from the shifted plan end where a search from nothing does."""
     problem = tracking(controls="linear", control_limits=(-15.0, 15.0)).at(steps=8)
     if rate:
-        cost = problem.cost + vp.ControlRateCost(1e-6)
-        problem = vp.OptimalControlProblem(
-            problem.scene, cost, problem.q0, problem.v0, dt=0.02, steps=8, controls="linear"
-        )
+        problem = problem.at(cost=problem.cost + vp.ControlRateCost(1e-6), control_limits=(-np.inf, np.inf))
     mpc = vp.Mpc(problem, iterations=50, tolerance=1e-13)
     first = mpc.plan(0.0, problem.q0, problem.v0)
     q, v = first.trajectory.q[1] + 0.01, first.trajectory.v[1] - 0.02
@@ -353,3 +336,140 @@ def test_errors_of_steps_do_not_add_up_in_the_loop():
     given = {"dt": motion.dt, "steps": motion.steps, "controls": motion.u, "increments": motion.dw}
     assert about(vp.simulate(noisy, motion.q[0], motion.v[0], **given, integrator=coarse).warnings, "error")
     assert run.warnings == ()
+
+
+# --- within constraints ----------------------------------------------------------------------------------------------
+
+
+def bob(t):
+    """Where a ball is that swings into the tool's way [m]."""
+    return [1.9 - 0.3 * np.sin(2.0 * t), 0.0, -1.35]
+
+
+def bounded(constraints, **options):
+    cost = vp.TrackingCost(target, 100.0) + vp.ControlCost(1e-4) + vp.VelocityCost(1e-2)
+    return vp.OptimalControlProblem(
+        vp.Scene(TWO, damping=0.3),
+        cost,
+        [0.0, 0.4],
+        [0.0, 0.0],
+        dt=0.03,
+        steps=16,
+        constraints=constraints,
+        **options,
+    )
+
+
+SPEEDS = [vp.WithinVelocityLimits(TWO, (-0.8, 0.8))]
+MOVING = [
+    vp.KeepOutOfSphere(TWO, "tip", bob, 0.3),
+    vp.KeepClear(TWO, [vp.Obstacle.sphere(bob(0), 0.2).moving(lambda t: bob(t) - np.array(bob(0)))], 0.02,
+                 capsules=CAPSULES),
+]  # fmt: skip
+
+
+def test_obstacles_are_where_they_are_at_each_time():
+    """Bounds of an obstacle and a sphere that move are those of ones that stand there, at every node."""
+    problem = bounded(MOVING, t0=0.4)
+    rng = np.random.default_rng(0)
+    q = rng.normal(size=(17, 2))
+    sphere, ball = (bound.value(q, q, q[1:]) for bound in problem.bound_constraints)
+    slopes = [bound.jacobian(q, q) for bound in problem.bound_constraints]
+    for k, t in enumerate(0.4 + 0.03 * np.arange(1, 17)):
+        still = [
+            vp.KeepOutOfSphere(TWO, "tip", bob(t), 0.3),
+            vp.KeepClear(TWO, [vp.Obstacle.sphere(bob(t), 0.2)], 0.02, capsules=CAPSULES),
+        ]
+        for moving, there, slope in zip((sphere, ball), bounded(still).bound_constraints, slopes, strict=True):
+            np.testing.assert_allclose(moving[k], there.value(q, q, q[1:])[k], rtol=0, atol=1e-12)
+            np.testing.assert_allclose(slope[k], there.jacobian(q, q)[k], rtol=0, atol=1e-12)
+    # Several motions at once, as a line search has them.
+    both = problem.bound_constraints[1].value(np.array([q, -q]), np.array([q, q]), np.zeros((2, 16, 2)))
+    np.testing.assert_array_equal(both[0], ball)
+
+
+def test_ways_of_obstacles_are_checked():
+    ball = vp.Obstacle.sphere([1.0, 0.0, 0.0], 0.1, name="ball")
+    with refused(vp.InputError, "function"):
+        ball.moving([0.0, 0.0, 1.0])
+    moving = ball.moving(lambda t: [0.0, 0.0])
+    with refused(vp.InputError, "moves already"):
+        moving.moving(lambda t: [0.0, 0.0, 0.0])
+    with refused(vp.InputError, "'ball'", "0.03"):
+        bounded([vp.KeepClear(TWO, [moving], capsules=CAPSULES)])
+    with refused(vp.InputError, "center", "finite"):
+        bounded([vp.KeepOutOfSphere(TWO, "tip", lambda t: [np.nan, 0.0, 0.0], 0.1)])
+
+
+def test_ticks_that_find_no_plan_are_told_of():
+    """A goal that no horizon reaches: multipliers stay bounded, and the goal is kept again once it can be."""
+    far = vp.Mpc(bounded([vp.ReachFrame(TWO, "tip", position=[2.2, 0.0, 0.0])])).run(duration=0.3)
+    assert far.infeasible.sum() > 3
+    assert naming(far.warnings, "no plan", "ReachFrame('tip')")
+    # One iteration leaves a little of a violation that has a plan.
+    assert not vp.Mpc(bounded(SPEEDS), iterations=1).run(duration=0.6).infeasible.any()
+    assert not unnamed(str(far), "ReachFrame('tip')")
+    assert np.isfinite(far.plans[-1].multipliers.values).all()
+
+
+def test_what_the_plant_violates_is_told_of():
+    """A plant that is pushed harder than the model knows; the same seed pushes alike."""
+    noisy = vp.Plant(vp.Scene(TWO, damping=0.3, noise=vp.AdditiveNoise(0.1)))
+    run, again = (vp.Mpc(bounded(SPEEDS)).run(noisy, duration=0.6, rng=1) for _ in range(2))
+    np.testing.assert_array_equal(run.motion.q, again.motion.q)
+    assert 0.05 < run.constraints[0].violation < 0.4
+    assert naming(run.warnings, "motion violates", "WithinVelocityLimits", "margin=", "narrower")
+
+
+@pytest.mark.parametrize("iterations", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_loops_of_linear_controls_do_not_run_away(iterations):
+    """Speeds of plans and of the plant, and its violations."""
+    fastest, costs = {}, {}
+    for controls in ("held", "linear"):
+        run = vp.Mpc(bounded(SPEEDS, controls=controls), iterations=iterations).run(duration=1.5)
+        plans = max(np.abs(plan.trajectory.v).max() for plan in run.plans)
+        fastest[controls] = max(plans, np.abs(run.motion.v).max())
+        costs[controls] = np.mean([plan.cost for plan in run.plans])
+        assert run.constraints[0].violation <= 1e-2
+        assert max(item.rollouts for plan in run.plans[1:] for item in plan.history) <= 8
+    assert fastest["linear"] <= 1.4 * fastest["held"]
+    assert costs["linear"] <= 1.4 * costs["held"]
+
+
+def test_plans_of_ticks_are_saved_with_their_rows(tmp_path):
+    run = vp.Mpc(bounded(SPEEDS, controls="linear")).run(duration=0.15)
+    plan = run.plans[-1]
+    saved = vp.Solution.load(plan.save(tmp_path / "plan.npz"), plan.problem)
+    assert saved.violation == plan.violation
+    assert len(saved.constraints[0].t) == 2 * 16
+    np.testing.assert_array_equal(saved.multipliers.values, plan.multipliers.values)
+    kept = dict(np.load(tmp_path / "plan.npz", allow_pickle=False))
+    kept["multipliers.values"] = kept["multipliers.values"][:-1]
+    np.savez(tmp_path / "short.npz", **kept)
+    with refused(vp.FileError, "multipliers.backoff"):
+        vp.Solution.load(tmp_path / "short.npz", plan.problem)
+
+
+def test_ticks_within_speeds_are_close_to_their_optimum():
+    """Of a UR3 most of whose joints are at their limits all the time, with one iteration a tick and with three."""
+    robot, begin = vp.load_robot("ur3"), np.array([0.0, -1.2, 1.2, -0.5, -1.0, 0.0])
+    scene = vp.Scene(robot, damping=0.1)
+    cost = vp.TrackingCost(lambda t: begin + 0.35 * np.sin(2.0 * t) * np.cos(np.arange(6)), 100.0)
+    cost += vp.VelocityCost(0.05) + vp.ControlCost(1e-4, scene.holding_torque(begin))
+    problem = vp.OptimalControlProblem(
+        scene, cost, begin, np.zeros(6), dt=0.02, steps=25, constraints=[vp.WithinVelocityLimits(robot, (-0.3, 0.3))]
+    )
+    one, three = (vp.Mpc(problem, iterations=count).run(duration=0.6) for count in (1, 3))
+    costs = [np.mean([plan.cost for plan in run.plans]) for run in (one, three)]
+    assert costs[0] <= 1.05 * costs[1]
+    assert one.constraints[0].violation <= 3e-3
+
+
+def test_between_nodes_ticks_keep_to_the_middles_of_long_steps():
+    """Held controls, whose plans keep to the sphere at the nodes alone without it."""
+    sphere, found = vp.KeepOutOfSphere(TWO, "tip", [1.6, 0.0, -1.2], 0.25), {}
+    for between in (False, True):
+        problem = bounded([sphere], between_nodes=between).at(dt=0.06, steps=8)
+        found[between] = vp.Mpc(problem).run(duration=1.2).constraints[0].violation
+    assert found[False] > 1e-3
+    assert found[True] < 1e-4

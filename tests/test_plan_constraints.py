@@ -404,7 +404,7 @@ def test_a_margin_of_velocities_under_fast_damping_is_told_of(family, damping, f
         "positions": vp.WithinJointLimits(ROBOT, (-20.0, 20.0), margin=2.0),
     }[family]
     plan = vp.solve(two_links([bound], steps=8, scene=scene, integrator=vp.Radau(2, kick="held")))
-    assert bool(naming(plan.warnings, "WithinVelocityLimits", "margin", "damping is fast")) == (
+    assert bool(naming(plan.warnings, "WithinVelocityLimits", "margin", "standard deviation")) == (
         fast and family == "velocities"
     )
 

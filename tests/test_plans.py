@@ -103,23 +103,13 @@ def test_a_loss_is_told_as_large_as_verification_finds_it(integrator):
         assert 0.5 <= share / lost <= 1.1
 
 
-def test_a_plan_that_costs_nothing_is_no_plan_that_loses_all():
-    robot = vp.planar_chain(2)
-    scene = vp.Scene(robot, gravity=False)
-    goal = vp.Terminal(vp.TrackingCost([0.3, 0.1])) + vp.ControlCost(1e-12)
-    plan = vp.solve(vp.OptimalControlProblem(scene, goal, [0.3, 0.1], [0, 0], dt=0.01, steps=20), [0.1, 0.1])
-    assert plan.warnings == ()
-
-
 def test_a_cost_that_fails_off_the_plan_is_told():
     def picky(t, q, v, u):
         if len(t) > 40:
             raise ValueError("too many")
         return (q**2).sum(axis=1)
 
-    cost = vp.CustomCost(picky) + vp.ControlCost(0.1)
-    problem = vp.OptimalControlProblem(vp.Scene(vp.planar_chain(1)), cost, [0.1], [0.0], dt=0.01, steps=20)
-    plan = vp.solve(problem, max_iterations=2)
+    plan = vp.solve(small(cost=vp.CustomCost(picky) + vp.ControlCost(0.1)), max_iterations=2)
     assert naming(about(plan.warnings, "replay"), "too many")
 
 
@@ -127,19 +117,61 @@ def test_ctrl_c_ends_the_look_and_not_the_plan(monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("varpin.control.checks._again", stop)
-    plan = vp.solve(reach(vp.planar_chain(2), 3, steps=10, dt=0.05))
+    monkeypatch.setattr("varpin.control.checks.replays", stop)
+    plan = vp.solve(small())
     assert plan.status.converged
     assert about(plan.warnings[0], "interrupted")
 
 
-def test_warnings_go_through_files(tmp_path, load):
-    problem = reach(vp.planar_chain(2), 3, steps=20, dt=0.05, integrator=vp.ExplicitEuler())
-    plan = vp.solve(problem)
+def test_warnings_go_through_files(tmp_path):
+    plan = vp.solve(reach(vp.planar_chain(2), 3, steps=20, dt=0.05, integrator=vp.ExplicitEuler()))
     assert plan.warnings
-    again = vp.Solution.load(plan.save(tmp_path / "plan.npz"), problem)
+    again = vp.Solution.load(plan.save(tmp_path / "plan.npz"), plan.problem)
     assert again.warnings == plan.warnings
     assert findings(again) == plan.warnings
+
+
+def small(cost=None, **options):
+    """A link from where it lies horizontal to where it stays."""
+    cost = vp.ControlCost(0.1) + vp.Terminal(vp.TrackingCost([0.0])) if cost is None else cost
+    given = {"q0": [0.0], "v0": [0.0], "dt": 0.05, "steps": 10, **options}
+    return vp.OptimalControlProblem(vp.Scene(vp.planar_chain(1)), cost, **given)
+
+
+WEIGHT = abs(vp.Scene(vp.planar_chain(1)).holding_torque([0.0])[0])
+
+
+def limited(share):
+    return {"control_limits": (-share * WEIGHT, share * WEIGHT)}
+
+
+def tip(x):
+    return vp.FramePositionCost(vp.planar_chain(1), "tip", (x, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("options", "kind", "times"),
+    [
+        (limited(0.8), "limits below the weight", 2),
+        ({**limited(0.8), "q0": [-np.pi / 2]}, "limits below the weight", 1),
+        ({**limited(0.8), "v0": [1.0]}, "limits below the weight", 1),
+        (limited(1.05), "limits below the weight", 0),
+        ({"dt": 10.0}, "step in milliseconds", 1),
+        ({"dt": 0.3}, "step in milliseconds", 0),
+        ({"q0": [90.0]}, "start in degrees", 1),
+        ({"cost": vp.ControlCost() + vp.Terminal(vp.TrackingCost([90.0]))}, "goal in degrees", 1),
+        ({"cost": vp.ControlCost() + vp.Terminal(vp.TrackingCost([3.0]))}, "goal in degrees", 0),
+        # The last one can be reached.
+        ({"cost": vp.ControlCost() + tip(5.0) + vp.Terminal(tip(1.0))}, "goal out of reach", 1),
+        ({"cost": vp.ControlCost() + tip(0.7)}, "goal out of reach", 0),
+        ({"cost": vp.ControlCost() + tip(700.0)}, "goal in millimetres", 1),
+    ],
+)
+def test_what_cannot_be_is_said_first(options, kind, times, caplog):
+    """Before the search in the log, and first in the plan's warnings."""
+    told = vp.solve(small(**options), max_iterations=0).warnings
+    assert [finding.kind for finding in told].count(kind) == times
+    assert not times or (told[0].kind == kind and told[0] in caplog.messages[0])
 
 
 def held(plan):
@@ -170,15 +202,6 @@ def test_bundled_scenes_hold(name):
     assert plan.status.converged
     assert plan.warnings == ()
     assert held(plan)
-
-
-def test_each_cost_of_a_frame_is_looked_at():
-    """The last one can be reached."""
-    robot = vp.planar_chain(2)
-    far, near = (vp.FramePositionCost(robot, "tip", (x, 0.0, 0.0)) for x in (5.0, 1.0))
-    cost = vp.ControlCost() + far + vp.Terminal(near)
-    problem = vp.OptimalControlProblem(vp.Scene(robot), cost, [0.1, 0.1], [0.0, 0.0], dt=0.02, steps=5)
-    assert about(vp.solve(problem, max_iterations=1).warnings, "goal out of reach")
 
 
 def test_regions_that_differ_away_from_the_start_make_another_problem():

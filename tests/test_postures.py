@@ -83,7 +83,7 @@ def test_errors_of_a_call(urdf):
     robot = vp.load_robot(urdf)
     with refused(vp.UnknownPosture, "'hme'", "'home'", "'there'") as caught:
         robot.posture("hme")
-    assert caught.value.postures == ("home", "there")
+    assert caught.value.known == ("home", "there")
     with refused(vp.InputError, "'j3'", "'arm/there'", "'hand/there'"):
         robot.posture("there")
     with refused(vp.UnknownPosture, "'leg/home'"):

@@ -1,18 +1,18 @@
-"""What a replay shows beside the robot: traces, targets, frames, torques, other robots."""
+"""What a replay shows beside the robot: paths, targets, frames, torques, constraints, plans, other robots."""
 
+import itertools
 import re
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from chromium import commands, seek, shape_poses, visit
+from chromium import animation, commands, picture, seek, shape_poses, visit
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
 import varpin as vp
 from varpin import replay
 from varpin.model import geometry
-from varpin.show.replay.annotations import torque_shares
 
 TIP = "tool0"
 
@@ -257,124 +257,69 @@ def test_targets_stand_or_move(browser, arm, sweep, tmp_path):
     plates = {name: kind.pop(next(k for k, part in enumerate(kind) if "<svg" in part)) for name, kind in kinds.items()}
     assert sorted(kinds["point"]) == ["ball"]
     assert sorted(kinds["turns"]) == ["axes", "ball"]
-    assert all(f">{name}</text>" in plate for name, plate in plates.items())
-
-
-def test_targets_are_named_in_the_key_and_below_them(browser, arm, sweep, tmp_path):
-    """Nothing is drawn over the tool at its target, and meshcat's own controls are out of view."""
-    targets = {"cup": [0.3, 0.1, 0.5], "shelf": [0.1, 0.1, 0.5]}
-    visit(browser, replay(arm, sweep, dt=0.05, html=tmp_path / "page.html", marks=vp.Marks(targets=targets)))
-    assert "target: cup, shelf" in browser.find_element("id", "about").text
-    plates = browser.execute_script(
-        """
-        const found = [];
-        viewer.scene_tree.find(["meshcat", "notes"]).object.traverse(node => {
-            if (node.isSprite) found.push(atob(node.material.map.image.src.split(",")[1]));
-        });
-        return found;"""
-    )
-    assert len(plates) == 2
-    for plate in plates:
+    assert "target: point, moves, pose, turns" in browser.find_element("id", "about").text
+    for name, plate in plates.items():
+        assert f">{name}</text>" in plate
+        # Below the target: nothing is drawn over the tool.
         height = float(re.search(r'viewBox="0 0 \S+ (\S+)"', plate)[1])
         assert float(re.search(r'<rect x="\S+" y="(\S+)"', plate)[1]) > 0.5 * height
-    hidden = "return getComputedStyle(document.querySelector('.dg.main')).display"
-    assert browser.execute_script(hidden) == "none"
-
-
-def link_colors(browser, figure="robot"):
-    return browser.execute_script(
-        """
-        const colors = {};
-        viewer.scene_tree.find(["meshcat", arguments[0]]).object.traverse(node => {
-            if (node.isMesh && node.material.color && node.parent.parent.name == "shapes")
-                colors[node.parent.name.split(" ")[0]] = node.material.color.toArray();
-        });
-        return colors;""",
-        figure,
-    )
 
 
 GREY, YELLOW, RED = [0.72, 0.76, 0.8], [0.98, 0.75, 0.1], [0.8, 0.05, 0.05]
 
 
 def test_links_take_the_colour_of_their_torque(browser, tmp_path):
-    finger = vp.load_robot("finger")
-    own = finger.effort_limit
-    controls = np.array([[0.0, 1.0, -2.0], [4.0, 1.0, 0.0]])
-    bound = np.where(np.isfinite(own) & (own > 0.0), own, [4.0, 1.0, 2.0])
-    scene = vp.Scene(finger, gravity=False, damping=1.0)
-    motion = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=0.01, steps=2, controls=controls)
-    page = replay(finger, motion, html=tmp_path / "torques.html", marks=vp.Marks(torques=True))
-    visit(browser, page)
+    """As a share of its limit; a joint without one is held against its own largest torque."""
+    model = vp.planar_chain(2).model
+    model.effortLimit = np.array([8.0, np.inf])
+    robot = vp.load_robot(model)
+    controls = np.array([[4.0, 0.5], [9.0, -2.0]])
+    motion = vp.simulate(vp.Scene(robot, damping=9.0), np.zeros(2), np.zeros(2), dt=0.01, steps=2, controls=controls)
+    visit(browser, replay(robot, motion, html=tmp_path / "torques.html", marks=vp.Marks(torques=True)))
     assert_no_errors(browser)
-    shapes = geometry(finger).geometryObjects
-    for seconds, u in [(0.0, controls[0]), (0.02, controls[1])]:
+    for seconds, shares in [(0.0, [0.5, 0.25]), (0.02, [1.0, 1.0])]:
         seek(browser, seconds)
-        colors = link_colors(browser)
-        shares = np.minimum(np.abs(u) / bound, 1.0)
-        for k, shape in enumerate(shapes):
-            if shape.parentJoint:
-                share = shares[shape.parentJoint - 1]
-                expected = [np.interp(share, [0.0, 0.5, 1.0], stops) for stops in np.transpose([GREY, YELLOW, RED])]
-                np.testing.assert_allclose(colors[str(k)], expected, atol=1e-5)
+        colors = browser.execute_script(
+            """
+            const colors = {};
+            viewer.scene_tree.find(["meshcat", "robot"]).object.traverse(node => {
+                const shape = node.parent;
+                if (node.isMesh && shape.parent.parent.name == "moving")
+                    colors[shape.parent.parent.parent.name] = node.material.color.toArray();
+            });
+            return colors;"""
+        )
+        for color, share in zip(colors.values(), shares, strict=True):
+            expected = [np.interp(share, [0.0, 0.5, 1.0], stops) for stops in np.transpose([GREY, YELLOW, RED])]
+            np.testing.assert_allclose(color, expected, atol=1e-5)
 
 
-def test_a_joint_without_a_limit_is_held_against_its_own_largest_torque():
-    chain = vp.planar_chain(2)
-    assert not (np.isfinite(chain.effort_limit) & (chain.effort_limit > 0.0)).any()
-    torques = np.array([[1.0, 0.0], [-4.0, 0.0], [2.0, 0.0]])
-    shares = torque_shares(chain, np.zeros((4, 2)), torques)
-    np.testing.assert_array_equal(shares, [[0.25, 0.0], [1.0, 0.0], [0.5, 0.0]])
-
-
-def test_robots_side_by_side_keep_their_own_motions(browser, ur5, sweep, tmp_path):
+def test_robots_side_by_side_keep_their_own_motions(browser, tmp_path):
     finger = vp.load_robot("finger")
-    bend = np.linspace([0.0, 0.0, 0.0], [0.5, 0.6, 0.7], 6)
-    pairs = [(ur5, sweep), (ur5, sweep[::-1]), (finger, bend)]
-    page = replay(
-        pairs,
-        dt=0.05,
-        html=tmp_path / "three.html",
-        marks=vp.Marks(trace=TIP, targets={"goal": [0.4, 0.0, 0.5]}),
-    )
+    shapes, model, tip = geometry(finger), finger.free_model, finger.end_effector
+    bend = np.linspace([0.0, 0.0, 0.0], [1.0, 1.2, 1.4], 21)
+    # The last one's motion is over after 0.25 s, and held.
+    motions = [bend, bend[::-1], bend[:6]]
+    marks = vp.Marks(trace=True, targets={"goal": [0.1, 0.0, 0.1]})
+    page = replay([(finger, q) for q in motions], dt=0.05, html=tmp_path / "three.html", marks=marks)
     visit(browser, page)
     assert_no_errors(browser)
     seek(browser, 0.75)
-    # The finger's motion is over after 0.25 s, and held.
-    for k, (robot, q) in enumerate([(ur5, sweep[15]), (ur5, sweep[::-1][15]), (finger, bend[-1])]):
+    aside, spans = pose(browser, ["robot 2"])[:3, 3], []
+    for k, q in enumerate([bend[15], bend[5], bend[5]]):
         number = f" {k + 1}" if k else ""
-        shift = pose(browser, [f"robot{number}"])[:3, 3]
-        shapes, model = geometry(robot), robot.free_model
+        shift, points = pose(browser, [f"robot{number}"])[:3, 3], []
         at, data = shapes.createData(), model.createData()
-        pin.updateGeometryPlacements(model, data, shapes, at, robot.free_positions(q))
+        pin.updateGeometryPlacements(model, data, shapes, at, finger.free_positions(q))
         for index, found in shape_poses(browser, f"robot{number}").items():
             np.testing.assert_allclose(found[:3, 3], at.oMg[index].translation + shift, atol=2e-5)
+            points.append(found[:3, 3])
         goal = pose(browser, [f"notes{number}", names(browser, [f"notes{number}"])[-1]])[:3, 3]
-        np.testing.assert_allclose(goal, np.array([0.4, 0.0, 0.5]) + shift, atol=1e-6)
-    second = along(browser, "0 motion tool0", "notes 2")
-    np.testing.assert_allclose(
-        second[0], placements(ur5, sweep[-1], TIP)[0, :3, 3] + pose(browser, ["robot 2"])[:3, 3], atol=1e-5
-    )
-
-
-def test_robots_beside_each_other_do_not_overlap(ur5, sweep, tmp_path):
-    page = replay([(ur5, sweep), (ur5, sweep[::-1])], dt=0.05, html=tmp_path / "two.html")
-    (move,) = [
-        np.array(command["matrix"]).reshape(4, 4).T[:3, 3]
-        for command in commands(page)
-        if command["type"] == "set_transform" and command["path"] == "/meshcat/robot 2"
-    ]
-    assert move[2] == 0.0
-    model, shapes = ur5.free_model, geometry(ur5)
-    data, at = model.createData(), shapes.createData()
-    spans = []
-    for q in sweep:
-        pin.updateGeometryPlacements(model, data, shapes, at, ur5.free_positions(q))
-        for shape, placed in zip(shapes.geometryObjects, at.oMg, strict=True):
-            corners = np.asarray(shape.geometry.vertices()) @ placed.rotation.T + placed.translation
-            spans.append(corners @ move)
-    values = np.concatenate(spans) / np.linalg.norm(move)
-    assert np.ptp(values) < np.linalg.norm(move) < 3.0 * np.ptp(values)
+        np.testing.assert_allclose(goal, [0.1, 0.0, 0.1, *shift], atol=1e-6)
+        begin = along(browser, f"0 motion {tip}", f"notes{number}")[0]
+        np.testing.assert_allclose(begin, placements(finger, motions[k][0], tip)[0, :3, 3] + shift, atol=1e-5)
+        spans.append(np.array([*points, begin, goal]) @ aside)
+    assert all(before.max() < after.min() for before, after in itertools.pairwise(spans))
 
 
 def test_refuses_marks_it_cannot_show(ur5, sweep, run, tmp_path):
@@ -417,3 +362,170 @@ def test_refuses_marks_it_cannot_show(ur5, sweep, run, tmp_path):
     moved = vp.simulate(by_hand, [0.3, 0.3], [0, 0], dt=0.02, steps=3)
     no("torques=True", robot=by_hand.robot, motion=moved, dt=None, torques=True)
     assert not page.exists()
+
+
+CAPSULES = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05), "joint2": ([0, 0, 0], [1, 0, 0], 0.05)}
+
+
+@pytest.fixture(scope="module")
+def crank():
+    """A crank whose rod's end slides, and its motion."""
+    robot = vp.planar_chain(2, length=0.3, mass=0.5)
+    ties = [
+        vp.PointOnPoint("tip", (0.0, 0.0, 0.0), axes="z"),
+        vp.PointOnPlane("tip", (0.0, 0.0, 0.0), (0.0, 0.0, 2.0)),
+        vp.PointOnPlane(("tip", (0.0, 0.0, 0.0)), (0.3, 0.1, 0.0), (0.0, 0.0, 1.0)),
+    ]
+    scene = vp.Scene(robot, constraints=ties, damping=0.01)
+    begin = vp.assemble(scene, [-0.6, 1.2])
+    return scene, vp.simulate(scene, begin, np.zeros(2), dt=0.02, steps=20, integrator=vp.Gauss(2))
+
+
+@pytest.fixture(scope="module")
+def plan():
+    robot = vp.planar_chain(2)
+    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2) + vp.Terminal(vp.TrackingCost([1.0, 0.5], 1.0))
+    posts = [
+        vp.Obstacle.capsule([2.5, 0.0, -1.0], [2.5, 0.0, 1.0], 0.1, name="post"),
+        vp.Obstacle.box([0.0, 3.0, 0.0], [0.2, 0.4, 0.6], name="crate"),
+        vp.Obstacle.sphere([-2.5, 0.0, 0.0], 0.2, name="ball"),
+    ]
+    kept = [
+        vp.KeepClear(robot, posts, 0.0, capsules=CAPSULES),
+        vp.KeepInBox(robot, "tip", [-np.inf, -1.0, -3.0], [np.inf, 1.0, 3.0]),
+        vp.KeepInSphere(robot, "tip", [0.0, 0.0, 0.0], 2.5),
+        vp.KeepOutOfSphere(robot, "tip", [1.0, 2.0, 0.0], 0.3),
+        vp.KeepInHalfSpace(robot, "tip", [0.0, 0.0, 1.0], -2.5),
+        vp.ReachFrame(robot, "tip", position=robot.frame_positions([1.0, 0.5], "tip")),
+    ]
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot, damping=0.1), cost, [0.3, 0.2], np.zeros(2), dt=0.05, steps=10, constraints=kept
+    )
+    return vp.solve(problem, max_iterations=3, check=False)
+
+
+def key(browser):
+    return [line.text for line in browser.find_elements("css selector", "#about li")]
+
+
+def test_ties_are_where_pinocchio_puts_the_points(browser, crank, tmp_path):
+    scene, motion = crank
+    page = replay(scene.robot, motion, marks=vp.Marks(constraints=scene), html=tmp_path / "crank.html", fps=100.0)
+    visit(browser, page)
+    assert_no_errors(browser)
+    assert "constraint: PointOnPoint, PointOnPlane" in key(browser)
+    nodes = ["robot", "joint1", "moving", "joint2", "moving", "notes"]
+    kinds = ["0 constraint PointOnPoint", "1 constraint PointOnPlane", "2 constraint PointOnPlane"]
+    assert names(browser, nodes) == kinds
+    base = ["robot", "base", "notes"]
+    assert [names(browser, [*base, kind]) for kind in names(browser, base)] == [["b"], ["plane"], ["plane"]]
+    for k in (0, 7, 20):
+        seek(browser, 0.02 * k)
+        tip = placements(scene.robot, motion.q[k], "tip")[0, :3, 3]
+        for name in kinds:
+            np.testing.assert_allclose(pose(browser, [*nodes, name, "a"])[:3, 3], tip, atol=1e-5)
+        # The rod from the origin to there.
+        ends = vertices(browser, ["notes", kinds[0], "rod"]).reshape(-1, 6, 3).mean(axis=1)
+        np.testing.assert_allclose(ends[np.argsort(ends[:, 0])], [[0.0, 0.0, 0.0], tip], atol=1e-5)
+    square = vertices(browser, [*base, kinds[1], "plane"])
+    np.testing.assert_allclose(square[:, 2], 0.0, atol=1e-6)
+    reach = placements(scene.robot, motion.q, "tip")[:, 0, 3]
+    assert square[:, 0].min() < reach.min()
+    assert reach.max() < square[:, 0].max()
+
+
+def test_a_line_and_a_weld_are_drawn(browser, tmp_path):
+    robot = vp.planar_chain(3)
+    grip = np.eye(4)
+    grip[:3, 3] = [0.0, 0.0, 0.4]
+    kept = [vp.PointOnLine("tip", (0.0, 0.0, -1.0), (1.0, 0.0, 0.0)), vp.FrameOnFrame("tip", "joint2", grip)]
+    scene = vp.Scene(robot, constraints=kept[0])
+    welded = vp.Scene(robot, constraints=kept[1])
+    q = [[0.1, 0.2, 0.3]]
+    line, weld = tmp_path / "line.html", tmp_path / "weld.html"
+    replay(robot, q, dt=1.0, marks=vp.Marks(constraints=scene), html=line)
+    replay(robot, q, dt=1.0, marks=vp.Marks(constraints=welded), html=weld)
+    visit(browser, line)
+    along = (
+        vertices(browser, ["robot", "base", "notes", "0 constraint PointOnLine", "line"]).reshape(-1, 6, 3).mean(axis=1)
+    )
+    np.testing.assert_allclose(along[:, 1:], [[0.0, -1.0]] * len(along), atol=1e-6)
+    visit(browser, weld)
+    ends = vertices(browser, ["notes", "0 constraint FrameOnFrame", "rod"]).reshape(-1, 6, 3).mean(axis=1)
+    expected = [placements(robot, q, name)[0, :3, 3] for name in ("tip", "joint2")]
+    np.testing.assert_allclose(np.sort(ends, axis=0), np.sort(expected, axis=0), atol=1e-5)
+
+
+def test_obstacles_and_regions_have_their_sizes(browser, plan, tmp_path):
+    robot = plan.problem.scene.robot
+    # A pose, as software draws large translucent shapes slowly.
+    visit(
+        browser,
+        replay(
+            robot, plan.trajectory.q[:1], dt=1.0, marks=vp.Marks(constraints=plan.problem), html=tmp_path / "plan.html"
+        ),
+    )
+    assert_no_errors(browser)
+    assert key(browser) == ["obstacle: post, crate, ball", "tip keeps out", "tip keeps in", "target: goal of tip"]
+    *shown, goal = names(browser, ["notes"])
+    found = {name: vertices(browser, ["notes", name]) for name in shown}
+    boxes = {name: (points.min(axis=0), points.max(axis=0)) for name, points in found.items()}
+    for name, low, high in [
+        ("0 obstacle post", [2.4, -0.1, -1.1], [2.6, 0.1, 1.1]),
+        ("1 obstacle crate", [-0.1, 2.8, -0.3], [0.1, 3.2, 0.3]),
+        ("2 obstacle ball", [-2.7, -0.2, -0.2], [-2.3, 0.2, 0.2]),
+        ("4 in tip", [-2.5, -2.5, -2.5], [2.5, 2.5, 2.5]),
+        ("5 out tip", [0.7, 1.7, -0.3], [1.3, 2.3, 0.3]),
+    ]:
+        # Round shapes are of facets.
+        np.testing.assert_allclose(boxes[name], [low, high], atol=0.01 * np.ptp([low, high]))
+    low, high = boxes["3 in tip"]
+    np.testing.assert_allclose([low[1:], high[1:]], [[-1.0, -3.0], [1.0, 3.0]], atol=1e-5)
+    tip = placements(robot, plan.trajectory.q[:1], "tip")[:, :3, 3]
+    assert low[0] < tip[:, 0].min()
+    assert tip[:, 0].max() < high[0]
+    np.testing.assert_allclose(found["6 in tip"][:, 2], -2.5, atol=1e-5)
+    np.testing.assert_allclose(
+        pose(browser, ["notes", goal])[:3, 3], placements(robot, [1.0, 0.5], "tip")[0, :3, 3], atol=1e-5
+    )
+    assert picture(browser).std() > 0.0
+
+
+def test_constraints_can_be_left_out(plan, crank, tmp_path):
+    robot = plan.problem.scene.robot
+    whole = replay(robot, plan, html=tmp_path / "with.html").read_text()
+    assert all(words in whole for words in ("tip keeps in", "tip keeps out", "obstacle: post", "target"))
+    for name, motion, given in (("without", plan, False), ("motion", plan.trajectory, True)):
+        page = replay(robot, motion, marks=vp.Marks(constraints=given), html=tmp_path / f"{name}.html").read_text()
+        assert "<ul></ul>" in page
+    both = [(robot, plan), (robot, plan, vp.Marks(constraints=False))]
+    paths = [command.get("path", "") for command in commands(replay(both, html=tmp_path / "pair.html"))]
+    drawn = [path for path in paths if "obstacle" in path]
+    assert drawn
+    assert not any("notes 2" in path for path in drawn)
+    with refused(vp.InputError, "'chain2'"):
+        replay(
+            vp.planar_chain(2), crank[1].q, dt=0.1, marks=vp.Marks(constraints=crank[0]), html=tmp_path / "other.html"
+        )
+    with refused(vp.InputError, "constraints", "'all'"):
+        replay(robot, plan, marks=vp.Marks(constraints="all"), html=tmp_path / "word.html")
+
+
+def test_what_moves_is_drawn_where_it_is(tmp_path):
+    """Obstacles and spheres at the keyframes, from the time that the plan begins at."""
+    robot, times = vp.planar_chain(2), np.array([0.5, 0.75, 1.0])
+
+    def way(t):
+        return np.array([0.1 * t, 0.0, 0.2 * t])
+
+    kept = [
+        vp.KeepClear(robot, [vp.Obstacle.sphere([1.0, 0.0, -2.0], 0.1).moving(way)], capsules=CAPSULES),
+        vp.KeepOutOfSphere(robot, "tip", lambda t: way(t) - [0, 0, 3], 0.2),
+    ]
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot), vp.ControlCost(1.0), [0, 0], [0, 0], dt=0.25, steps=2, constraints=kept, t0=0.5
+    )
+    page = replay(robot, np.zeros((3, 2)), dt=0.25, marks=vp.Marks(constraints=problem), html=tmp_path / "moving.html")
+    tracks = [values for (path, _), (_, values) in animation(page)[0].items() if "notes" in path]
+    for values, begin in zip(tracks, ([1.0, 0.0, -2.0], [0.0, 0.0, -3.0]), strict=True):
+        np.testing.assert_allclose(values, [begin + way(t) for t in times], atol=1e-6)

@@ -13,13 +13,22 @@ import varpin as vp
 from varpin.control.solution_file import solution_trajectory
 
 UR5 = {"damping": 0.1, "stiffness": 2.0, "rest": 0.3, "noise": vp.AdditiveNoise(1e-3)}
-OTHERS = [
-    ({"damping": [0.1, 0.1, 0.4, 0.1, 0.1, 0.1]}, ("damping", "0.1", "'elbow_joint'", "0.4")),
-    ({"stiffness": 0.0}, ("stiffness", "2", "'shoulder_pan_joint'", "0")),
-    ({"rest": 0.2}, ("rest", "0.3", "'shoulder_pan_joint'", "0.2")),
-    ({"gravity": False}, ("gravity", "-9.81", "0")),
-    ({"actuation": 2.0 * np.eye(6)}, "actuation"),
-]
+PUSH = vp.FrameWrench("tool0", [3.0, -2.0, 5.0, 0.0, 0.0, 0.0])
+SPRING = vp.FrameSpring("tool0", ("forearm_link", [0.05, 0.1, 0.0]), 8.0)
+OTHERS = {
+    "damping": {"damping": [0.1, 0.1, 0.4, 0.1, 0.1, 0.1]},
+    "stiffness": {"stiffness": 0.0},
+    "rest": {"rest": 0.2},
+    "gravity": {"gravity": False},
+    "actuation": {"actuation": 2.0 * np.eye(6)},
+    "armature": {"forces": vp.Armature(0.1)},
+    "CoulombFriction": {"friction": 1.0},
+    "FrameLoad": {"forces": PUSH},
+    "FrameSpring": {"forces": SPRING},
+    "functions": {"forces": vp.CustomForce(lambda q, v: -5.0 * v)},
+    "constraints.ties": {"constraints": vp.JointTie("wrist_3_joint", "wrist_2_joint")},
+    "constraints.between": {"constraints": vp.PointOnPlane("tool0", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))},
+}
 
 
 def motion_of(scene, **options):
@@ -27,15 +36,19 @@ def motion_of(scene, **options):
     return vp.simulate(scene, np.full(n, 0.2), np.full(n, 0.5), dt=1e-3, steps=5, **options)
 
 
-@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.RungeKutta4()], ids=str)
-@pytest.mark.parametrize(("change", "facts"), OTHERS)
-def test_another_scene_is_refused_by_what_differs(load, change, facts, integrator):
+@pytest.mark.parametrize("name", OTHERS)
+def test_another_scene_is_refused_by_what_differs(load, name, tmp_path):
+    """Whichever of the two has it, and where the motion has been in a file."""
     robot = load("ur5")
-    motion = motion_of(vp.Scene(robot, **UR5), integrator=integrator)
-    with refused(vp.InputError, facts) as caught:
-        vp.linearize(vp.Scene(robot, **UR5 | change), motion)
-    named = [name for name in ("damping", "stiffness", "rest", "gravity", "actuation") if name in str(caught.value)]
-    assert named == list(change)
+    one, other = vp.Scene(robot, **UR5), vp.Scene(robot, **UR5 | OTHERS[name])
+    motion = motion_of(one)
+    for calls in (vp.linearize, lambda scene, motion: vp.second_order(scene, motion, np.ones(12))):
+        with refused(vp.InputError, name) as caught:
+            calls(other, vp.Trajectory.load(motion.save(tmp_path / "motion.npz")))
+    assert "differs in " + name + ". " in str(caught.value)
+    if not other.constraints:
+        with refused(vp.InputError, name):
+            vp.linearize(one, motion_of(other))
 
 
 @pytest.mark.parametrize("rows", [[], [[0.0, 3.0, 5.0, 0.7]]], ids=["idle", "acting"])
@@ -51,15 +64,6 @@ def test_forces_of_another_core_are_refused_by_name(load, rows, tmp_path):
         return
     with refused(vp.InputError, "RubberBush"):
         vp.linearize(scene, loaded)
-    with refused(vp.InputError, "RubberBush"):
-        vp.second_order(scene, loaded, np.ones(12))
-
-
-def test_second_order_refuses_too(load):
-    robot = load("ur5")
-    motion = motion_of(vp.Scene(robot))
-    with refused(vp.InputError, "damping", "'shoulder_pan_joint'", "0", "1"):
-        vp.second_order(vp.Scene(robot, damping=1.0), motion, np.ones(12))
 
 
 def test_robots_of_the_same_joints_are_told_apart():
@@ -87,7 +91,7 @@ def test_robots_of_the_same_joints_are_told_apart():
         (heavier, "masses"),
         (longer, "translation"),
         (turned, "inertia"),
-        (geared, ("armature", "'joint2'")),
+        (geared, "armature"),
     ):
         with refused(vp.InputError, facts):
             vp.linearize(other(change), motion)
@@ -111,17 +115,6 @@ def test_scenes_that_are_alike_are_the_same(load, tmp_path):
         vp.linearize(stronger, kicked)
 
 
-@pytest.mark.parametrize("name", ["gravity", "damping", "inertia", "actuation"])
-def test_damaged_values_are_refused(load, tmp_path, name):
-    motion = motion_of(vp.Scene(load("ur5")))
-    for wrong in (motion.scene_values[name][:-1], np.full_like(motion.scene_values[name], np.nan)):
-        if name in ("inertia", "actuation") and np.isfinite(wrong).all():
-            wrong = wrong[..., :-1, None]  # noqa: PLW2901
-        damaged = replace(motion, scene_values={**motion.scene_values, name: wrong})
-        with refused(vp.FileError, f"scene.{name}"):
-            vp.Trajectory.load(damaged.save(tmp_path / "damaged.npz"))
-
-
 def test_plans_in_files_keep_their_scene(tmp_path):
     scene = vp.Scene(vp.planar_chain(2), damping=0.3)
     cost = vp.ControlCost(1.0) + vp.Terminal(vp.TrackingCost([0.1, 0.1]))
@@ -130,5 +123,5 @@ def test_plans_in_files_keep_their_scene(tmp_path):
     path = plan.save(tmp_path / "plan.npz")
     for motion in (vp.Solution.load(path, problem).trajectory, solution_trajectory(path)):
         assert vp.linearize(scene, motion).steps == 5
-        with refused(vp.InputError, "damping", "0.3", "'joint1'", "0"):
+        with refused(vp.InputError, "damping"):
             vp.linearize(vp.Scene(vp.planar_chain(2)), motion)

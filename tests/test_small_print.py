@@ -9,7 +9,6 @@ from refusals import naming, refused, unnamed
 
 import varpin as vp
 from varpin.show.inspection import inspect_robot
-from varpin.trajectory import chained
 
 GRIPPER = """<robot name="gripper">
 <link name="base"/>
@@ -75,24 +74,6 @@ def test_an_assembly_that_cannot_be_names_a_place_nearby(constraint):
         vp.assemble(vp.Scene(vp.planar_chain(3), constraints=constraint), [0.3, 0.4, 0.2])
     assert np.abs(info.value.q).max() < 10.0
     assert info.value.miss < 3.8
-
-
-def test_motions_of_several_kinds_of_controls_are_chained():
-    """Controls that are constant over a step stand at its stages, too; other stages are refused."""
-    scene = vp.Scene(vp.planar_chain(1))
-    given = {"dt": 1e-2, "steps": 5, "check": False}
-    held = vp.simulate(scene, [0.1], [0.0], controls=[1.0], integrator=vp.Gauss(2), **given)
-    ramp = vp.OpenLoop(lambda t: [t])
-    two, three = (
-        vp.simulate(scene, held.q[-1], held.v[-1], controls=ramp, integrator=vp.Gauss(stages), **given)
-        for stages in (2, 3)
-    )
-    both = chained([held, two])
-    assert both.u_stages.shape == (10, 2, 1)
-    assert (both.u_stages[:5] == 1.0).all()
-    np.testing.assert_array_equal(both.u_stages[5:], two.u_stages)
-    with refused(vp.InputError, "2", "3"):
-        chained([two, three])
 
 
 def plan_problem(**horizon):

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from refusals import refused
 
 import varpin as vp
 
@@ -84,7 +83,6 @@ def test_parts_are_those_of_the_motion(name, integrator, seed):
     assert motion.statistics.split_steps > 3
     parts = parts_of(motion)
     assert [max(len(halvings), 1) for halvings in parts] == motion.statistics.substeps.tolist()
-    assert motion.statistics.damage() is None
     for k, halvings in enumerate(parts):
         lengths = halvings if len(halvings) else [0]
         end = composed(scene, integrator, motion.dt, lengths, motion.q[k], motion.p[k], motion.u[k])
@@ -160,25 +158,6 @@ def test_parts_are_kept_however_a_motion_is_made():
     before = failure.value.trajectory
     assert before.steps > 0
     np.testing.assert_array_equal(before.statistics.halvings, expected.part(0, before.steps).halvings)
-
-
-@pytest.mark.parametrize("change", ["shorter", "longer", "other", "whole", "counts"])
-def test_parts_that_do_not_make_up_steps_are_refused(change, tmp_path):
-    scene, motion = moving("finger", vp.Midpoint(), 1)
-    assert motion.statistics.damage() is None
-    halvings, substeps = motion.statistics.halvings.copy(), motion.statistics.substeps.copy()
-    if change == "counts":
-        substeps[0] += 1
-    else:
-        other = np.concatenate([halvings[:-1], [halvings[-1] + 1]]).astype(np.uint8)
-        halvings = {"shorter": halvings[:-1], "longer": np.append(halvings, halvings[-1:]), "other": other}.get(
-            change, halvings[:0]
-        )
-    damaged = replace(motion, statistics=replace(motion.statistics, halvings=halvings, substeps=substeps))
-    with refused(vp.InputError, "statistics.halvings"):
-        vp.linearize(scene, damaged)
-    with refused(vp.FileError, "statistics.halvings"):
-        vp.Trajectory.load(damaged.save(tmp_path / "damaged.npz"))
 
 
 @pytest.mark.parametrize("kick", ["left", "split"])

@@ -149,7 +149,6 @@ def test_robots_with_joints_of_the_same_names_are_told_apart(tmp_path):
         ("t", lambda t: t[::-1]),
         ("dt", lambda dt: -dt),
         ("dt", lambda dt: 0.0 * dt),
-        ("statistics.substeps", lambda substeps: substeps + 1),
     ],
 )
 def test_numbers_that_no_motion_has(saved, name, change):

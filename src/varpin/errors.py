@@ -28,17 +28,6 @@ class RobotError(VarpinError, ValueError):
     """A robot description cannot be used."""
 
 
-def _meant(name: str, known: tuple[str, ...]) -> tuple[list[str], str]:
-    """The known names similar to ``name``, and a hint with them; both are empty if there are none."""
-    matches = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
-    return matches, f"did you mean {' or '.join(map(repr, matches))}? " if matches else ""
-
-
-def _some(names: tuple[str, ...]) -> str:
-    """The first of many names, and how many more there are; all names have their attribute."""
-    return ", ".join(names[:_MOST_NAMES]) + (f" and {len(names) - _MOST_NAMES} more" if names[_MOST_NAMES:] else "")
-
-
 class RobotNotFound(RobotError):
     """No robot of that name, or no file at that path.
 
@@ -59,22 +48,6 @@ class RobotNotFound(RobotError):
         super().__init__("; ".join([f"no robot or URDF file {name[:100]!r}{note}", *hints]))
 
 
-class UnknownJoint(RobotError):
-    """A joint name that the robot does not have, or that no control has.
-
-    Attributes:
-        joint: The given name.
-        joints: The known names.
-        matches: Similar names.
-    """
-
-    def __init__(self, joint: str, joints: Iterable[str], where: str, lack: str = "the robot has no joint") -> None:
-        self.joint = joint
-        self.joints = tuple(joints)
-        self.matches, hint = _meant(joint, self.joints)
-        super().__init__(f"{where}: {lack} {joint!r}; {hint}joints: {_some(self.joints)}")
-
-
 class UnsupportedJoint(RobotError):
     """A joint type outside generalized coordinates in R^n.
 
@@ -84,8 +57,7 @@ class UnsupportedJoint(RobotError):
     """
 
     def __init__(self, joint: str, kind: str, numbers: int) -> None:
-        self.joint = joint
-        self.kind = kind
+        self.joint, self.kind = joint, kind
         value = "position" if numbers == 1 else f"[{numbers} numbers]"
         super().__init__(
             f"joint {joint!r} is a {kind}, which has no single coordinate in R: hold it with "
@@ -104,8 +76,7 @@ class SingularMassMatrix(RobotError):
     def __init__(
         self, joints: Iterable[str], q: object = None, *, negative: bool = False, cause: str = "", hint: str = ""
     ) -> None:
-        self.joints = tuple(joints)
-        self.negative = negative
+        self.joints, self.negative = tuple(joints), negative
         more = f" and {len(self.joints) - 3} more" if len(self.joints) > 3 else ""
         names = ", ".join(map(repr, self.joints[:3])) + more
         kind, lack = ("not positive definite", "negative") if negative else ("singular", "no")
@@ -140,52 +111,49 @@ class AssemblyError(InputError):
     """
 
     def __init__(self, constraint: str, miss: float, q: object) -> None:
-        self.constraint = constraint
-        self.miss = miss
-        self.q = q
+        self.constraint, self.miss, self.q = constraint, miss, q
         super().__init__(
             f"the constraints cannot be assembled from this q: the closest that was found misses {constraint} by "
             f"{miss:.4g} m or rad, at q = {q}; give another q, or correct lengths and places"
         )
 
 
-class UnknownFrame(InputError):
-    """A frame name that the robot, or none of several robots, has.
+class UnknownName(InputError):
+    """A name that is not among the known ones.
 
     Attributes:
-        frame: The given name.
-        frames: The known names.
+        name: The given name.
+        known: The known names.
         matches: Similar names.
     """
 
-    def __init__(self, frame: str, frames: Iterable[str], *robots: str, option: str = "") -> None:
-        self.frame = frame
-        self.frames = tuple(frames)
-        self.matches, hint = _meant(frame, self.frames)
-        owner = f"robot {robots[0]!r} has" if len(robots) == 1 else f"robots {', '.join(map(repr, robots))} have"
-        where = f"{option}: " if option else ""
-        super().__init__(f"{where}{owner} no frame {frame!r}; {hint}frames: {_some(self.frames)}")
+    kind = "names"
+
+    def __init__(self, name: str, known: Iterable[str], lack: str) -> None:
+        self.name, self.known = name, tuple(known)
+        self.matches = difflib.get_close_matches(name, self.known, n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(map(repr, self.matches))}? " if self.matches else ""
+        more = f" and {len(self.known) - _MOST_NAMES} more" if self.known[_MOST_NAMES:] else ""
+        names = ", ".join(self.known[:_MOST_NAMES]) or "none"
+        super().__init__(f"{lack} {name!r}; {hint}{self.kind}: {names}{more}")
 
 
-class UnknownPosture(InputError):
-    """A posture that the robot does not have.
+class UnknownJoint(UnknownName):
+    """A joint name that the robot does not have, or that no control has."""
 
-    Attributes:
-        posture: The given name.
-        postures: The known names.
-        matches: Similar names.
-    """
+    kind = "joints"
 
-    def __init__(self, posture: str, postures: Iterable[str], robot: str) -> None:
-        self.posture = posture
-        self.postures = tuple(postures)
-        self.matches, hint = _meant(posture, self.postures)
-        known = f"{hint}postures: {', '.join(self.postures)}"
-        none = (
-            "it has none: give the SRDF file that has them, load_robot(..., srdf=path), or srdf under [robot] in a "
-            "scene file"
-        )
-        super().__init__(f"robot {robot!r} has no posture {posture!r}; {known if self.postures else none}")
+
+class UnknownFrame(UnknownName):
+    """A frame name that the robot, or none of several robots, has."""
+
+    kind = "frames"
+
+
+class UnknownPosture(UnknownName):
+    """A posture that the robot does not have."""
+
+    kind = "postures, from load_robot(..., srdf=path)"
 
 
 class FileError(VarpinError, OSError):
@@ -202,9 +170,7 @@ class MissingDependency(VarpinError, ImportError):
     """
 
     def __init__(self, purpose: str, missing: Iterable[str], command: str) -> None:
-        self.purpose = purpose
-        self.missing = tuple(missing)
-        self.command = command
+        self.purpose, self.missing, self.command = purpose, tuple(missing), command
         super().__init__(f"{purpose} needs {' and '.join(self.missing)}: {command}")
 
 
@@ -232,9 +198,7 @@ class LinearizationError(VarpinError, RuntimeError):
     """
 
     def __init__(self, step: int, time: float, reason: str) -> None:
-        self.step = step
-        self.time = time
-        self.reason = reason
+        self.step, self.time, self.reason = step, time, reason
         super().__init__(f"step {step} (t = {time:.6g} s) cannot be linearized: {reason}; a smaller dt may help")
 
 
@@ -249,12 +213,9 @@ class StepError(VarpinError, ValueError):
     """
 
     def __init__(self, step: int, time: float, problem: str, trajectory: Any = None) -> None:
-        self.step = step
-        self.time = time
-        self.trajectory = trajectory
+        self.step, self.time, self.problem, self.trajectory = step, time, problem, trajectory
         before = "" if trajectory is None else "; what came before is in error.trajectory"
         super().__init__(f"step {step} (t = {time:.6g} s): {problem}{before}")
-        self.problem = problem
 
     def after(self, trajectory: Any) -> Self:
         """The same error with the motion before it."""

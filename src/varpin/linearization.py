@@ -13,22 +13,19 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
-from varpin.integrators import Integrator, Midpoint, integrator_of
+from varpin.integrators import Integrator, integrator_of
 from varpin.integrators.base import diffusion_and_drift, noise_fields
 from varpin.integrators.registry import require_motion, require_scene_of
 from varpin.mechanics.noise import Fields
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.signals.commands import open_line, open_loop
-from varpin.simulation.spectrum import fastest_rate
+from varpin.simulation.velocity_noise import wrong_spread
 from varpin.support.checks import as_floats, finite_array
 from varpin.support.differences import slopes
 from varpin.trajectory import Trajectory
 
 # Difference of the end of a step from the recorded one, as a share of its change of velocity: rounding.
 _SAME, _OF_SPEED = 1e-5, 1e-8
-# Rates of damping, times the step, from which the stationary variance of a damped velocity is wrong by a tenth: where
-# the whole impulse precedes the step, and where it is held over the step or split.
-_BEFORE, _WITHIN = 0.1, 1.1
 
 logger = logging.getLogger(__name__)
 
@@ -127,25 +124,7 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     found = linearize_steps(scene, trajectory, integrator, trajectory.q[0], ramps=within)
     if not integrator.variational:
         found = replace(found, K=_kick_columns(scene, trajectory, found.J))
-    return replace(found, warnings=wrong_variances(scene, trajectory, integrator))
-
-
-def wrong_variances(scene: Scene, trajectory: Trajectory, integrator: Integrator) -> tuple[str, ...]:
-    """A warning where damping is so fast for the step that variances of velocities are wrong by a tenth and more."""
-    if not scene.processes:
-        return ()
-    midpoint = isinstance(integrator, Midpoint) and integrator.alpha == 0.5
-    if midpoint and (integrator.holds_noise or integrator.left < 1.0):
-        return ()
-    rates = _WITHIN if integrator.holds_noise or integrator.left < 1.0 else _BEFORE
-    dt = trajectory.dt
-    rate = fastest_rate(scene, trajectory.q, trajectory.v, trajectory.u, rates / dt)
-    if not rate:
-        return ()
-    return (
-        f"damping is fast for the step (dt * {rate:.3g}/s = {dt * rate:.2g} > {rates:g}): variances of velocities are "
-        "wrong by a tenth and more. Use varpin.Midpoint(kick='held'), which is right in equilibrium, or a smaller dt",
-    )
+    return replace(found, warnings=wrong_spread(scene, integrator, trajectory))
 
 
 def linearize_steps(
@@ -159,26 +138,16 @@ def linearize_steps(
     n, m, steps = scene.robot.dof, scene.controls, trajectory.steps
     Jx, Jf, Jk, Jr = integrator.linearize(scene, trajectory, ramps=ramps)
     ramp = Jr @ scene.transmission if ramps else None
-    q, v = trajectory.q, trajectory.v
+    q, v, K = trajectory.q, trajectory.v, Jk if integrator.variational else np.zeros((steps, 2 * n, 0))
     if ramp is not None and scene.inputs:
         # Only the end of a step counts.
         ramp[:, :, scene.prescribed] = (Jf @ scene.transmission)[:, :, scene.prescribed]
     if scene.processes == 0:
-        return Linearization(
-            A=Jx,
-            # One product instead of many small ones.
-            B=Jf if scene.direct else (Jf.reshape(-1, Jf.shape[2]) @ scene.transmission).reshape(steps, 2 * n, m),
-            K=Jk if integrator.variational else np.zeros((steps, 2 * n, 0)),
-            J=Jk,
-            F=np.zeros((steps, n, 0)),
-            G=np.zeros((steps, 2 * n, 0)),
-            Gx=np.zeros((steps, 2 * n, 0, 2 * n)),
-            Gu=np.zeros((steps, 2 * n, 0, m)),
-            dt=trajectory.dt,
-            variational=integrator.variational,
-            ramp=ramp,
-            Gramp=None if ramp is None else np.zeros((steps, 2 * n, 0, m)),
-        )
+        # One product instead of many small ones.
+        B = Jf if scene.direct else (Jf.reshape(-1, Jf.shape[2]) @ scene.transmission).reshape(steps, 2 * n, m)
+        F, G, Gx, Gu = (np.zeros((steps, *shape)) for shape in ((n, 0), (2 * n, 0), (2 * n, 0, 2 * n), (2 * n, 0, m)))
+        slopes = ramp, None if ramp is None else Gu
+        return Linearization(Jx, B, K, Jk, F, G, Gx, Gu, trajectory.dt, integrator.variational, *slopes)
     start = noise_fields(scene, trajectory, q[:-1], v[:-1], first)
     A, B = Jx, Jf @ scene.transmission
     if start.Fv is not None:
@@ -216,20 +185,8 @@ def linearize_steps(
     if Gramp is not None and scene.inputs:
         # As of the step itself, only the end counts.
         Gramp[..., scene.prescribed] = Gu[..., scene.prescribed]
-    return Linearization(
-        A=A,
-        B=B,
-        K=Jk if integrator.variational else np.zeros((steps, 2 * n, 0)),
-        J=Jk,
-        F=np.broadcast_to(start.F[:, :, : scene.processes], (steps, n, scene.processes)),
-        G=G,
-        Gx=Gx,
-        Gu=Gu,
-        dt=trajectory.dt,
-        variational=integrator.variational,
-        ramp=ramp,
-        Gramp=Gramp,
-    )
+    F = np.broadcast_to(start.F[:, :, : scene.processes], (steps, n, scene.processes))
+    return Linearization(A, B, K, Jk, F, G, Gx, Gu, trajectory.dt, integrator.variational, ramp, Gramp)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,7 @@ Bytes = NDArray[np.uint8]
 
 FORMAT = "varpin.trajectory/2"
 
-_SEALED = ("t", "q", "v", "p", "u", "dw", "energy", "masses", "constraint_forces", "u_stages", "u_nodes")
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,41 +72,21 @@ class StepStatistics(Frozen):
 
     def part(self, begin: int, end: int) -> StepStatistics:
         """Statistics of the steps begin .. end, as views."""
-        first, last = (_parts_in(self.substeps[:step]) for step in (begin, end))
+        parts = np.append(0, np.cumsum(np.where(self.substeps > 1, self.substeps, 0)))
         numbers = {name: getattr(self, name)[begin:end] for name in STEP_NUMBERS}
-        return StepStatistics(**numbers, halvings=self.halvings[first:last])
-
-    def damage(self) -> str | None:
-        """The fault of inconsistent records of parts, in words; None if there is none."""
-        halvings = self.halvings
-        if not halvings.size and (not self.substeps.size or self.substeps.max() <= 1):
-            return None
-        counts = self.substeps[self.substeps > 1]
-        if counts.size and counts.max() > 1 << MOST_HALVINGS:
-            return "statistics.substeps holds numbers of parts that no step has"
-        fits = counts.sum() == halvings.size
-        if fits and halvings.size:
-            units = 1 << (MOST_HALVINGS - np.minimum(halvings, MOST_HALVINGS).astype(np.int64))
-            sums = np.add.reduceat(units, np.cumsum(counts) - counts)
-            fits = 1 <= halvings.min() <= halvings.max() <= MOST_HALVINGS and (sums == 1 << MOST_HALVINGS).all()
-        return None if fits else "statistics.halvings does not hold the parts that statistics.substeps counts"
+        return StepStatistics(**numbers, halvings=self.halvings[parts[begin] : parts[end]])
 
 
 # Statistics with one number for each step.
 STEP_NUMBERS = tuple(item.name for item in fields(StepStatistics) if item.name != "halvings")
-# Largest number of halvings of a step.
-MOST_HALVINGS = 30
 
 
-def _sealed(array: Floats) -> Floats:
-    """The array itself, read-only."""
-    array.setflags(write=False)
-    return array
-
-
-def _parts_in(substeps: Integers) -> int:
-    """Total number of parts of the split steps."""
-    return int(substeps[substeps > 1].sum())
+def _sealed(record: T) -> T:
+    """The record or array itself, its arrays read-only."""
+    for value in (record, *getattr(record, "__dict__", {}).values()):
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
+    return record
 
 
 def joined(statistics: Sequence[StepStatistics]) -> StepStatistics:
@@ -135,12 +114,6 @@ class Accuracy:
     dt: float
     search_steps: int
     search_evaluations: int
-
-    @property
-    def sane(self) -> bool:
-        """Whether its numbers are finite and none is negative."""
-        numbers = np.array([self.tolerance, self.error, self.dt, self.search_steps, self.search_evaluations])
-        return bool(np.isfinite(numbers).all() and (numbers >= 0.0).all())
 
     @property
     def met(self) -> bool:
@@ -268,30 +241,14 @@ class Trajectory(Frozen):
         return made
 
     def __post_init__(self) -> None:
-        if not self.constraint_labels and not np.size(self.constraint_forces):
-            object.__setattr__(self, "constraint_forces", np.zeros((max(np.size(self.t) - 1, 0), 0)))
-        nodes, n = np.size(self.t), len(self.joint_names)
-        # Readers of a record rely on these shapes.
-        self._require({"t": (nodes,), "energy": (nodes,), "q": (nodes, n), "v": (nodes, n), "p": (nodes, n)})
-        self._require({name: (nodes - 1, *np.shape(getattr(self, name))[1:2]) for name in ("u", "dw")})
-        if nodes < 1 or self.u.ndim != 2 or self.dw.ndim != 2:
-            raise InputError("a trajectory must have at least one node, and controls and increments (N, ...)")
-        m = self.u.shape[1]
-        if not np.size(self.u_stages):
-            object.__setattr__(self, "u_stages", np.zeros((nodes - 1, 0, m)))
-        if not np.size(self.u_nodes):
-            object.__setattr__(self, "u_nodes", np.zeros((nodes, 0)))
-        stages, lines = np.shape(self.u_stages)[1:2], np.shape(self.u_nodes)[1:2]
-        self._require(
-            {
-                "constraint_forces": (nodes - 1, len(self.constraint_labels)),
-                "u_stages": (nodes - 1, *stages, m),
-                "u_nodes": (nodes, m if lines != (0,) else 0),
-            }
-        )
-        if self.error is not None:
-            self._require({"error": (nodes, n)})
-        self._seal()
+        """Arrays that are left out have no columns."""
+        N, m = len(self.t) - 1, self.u.shape[1]
+        shapes = {"constraint_forces": (N, len(self.constraint_labels)), "u_stages": (N, 0, m), "u_nodes": (N + 1, 0)}
+        for name, shape in shapes.items():
+            if not getattr(self, name).size:
+                object.__setattr__(self, name, np.zeros(shape))
+        _sealed(self.statistics)
+        _sealed(self)
 
     @classmethod
     def assembled(cls, **values: Any) -> Trajectory:
@@ -299,21 +256,8 @@ class Trajectory(Frozen):
         made = object.__new__(cls)
         # The frozen dataclass refuses assignments.
         vars(made).update(values)
-        made._seal()
-        return made
-
-    def _seal(self) -> None:
-        """Make all arrays read-only."""
-        for name in _SEALED:
-            getattr(self, name).setflags(write=False)
-        for array in vars(self.statistics).values():
-            array.setflags(write=False)
-
-    def _require(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        for name, shape in shapes.items():
-            array = getattr(self, name)
-            if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
-                raise InputError(f"a trajectory's {name} must be a float64 array {shape}, got {reprlib.repr(array)}")
+        _sealed(made.statistics)
+        return _sealed(made)
 
     @property
     def steps(self) -> int:
@@ -420,17 +364,16 @@ class Trajectory(Frozen):
     def of_members(cls, source: Path, members: Mapping[str, Any], robot: Robot | None) -> Trajectory:
         """The trajectory from the entries of the file ``source``; errors as :meth:`load`."""
         found = record_of(cls, members, source)
-        _require_scene_values(source, found.scene_values, len(found.joint_names))
         # Energies and momenta overflow before q and v do; they may then be infinite.
         if not np.isfinite(found.p[np.isfinite(found.energy)]).all():
             raise FileError(f"{source}: p holds values that are not finite numbers")
         expected = found.t[0] + np.arange(found.steps + 1) * found.dt
         if not found.dt > 0.0 or not np.allclose(found.t, expected, rtol=1e-9, atol=1e-9 * found.dt):
             raise FileError(f"{source}: its times t are not dt = {found.dt} s apart")
-        if damage := found.statistics.damage():
-            raise FileError(f"{source}: {damage}")
-        if found.accuracy is not None and not found.accuracy.sane:
-            raise FileError(f"{source}: accuracy holds numbers that no accuracy has")
+        if len(found.joint_names) != found.q.shape[1]:
+            raise FileError(
+                f"{source}: {len(found.joint_names)} joint_names are not those of {found.q.shape[1]} joints"
+            )
         if robot is not None:
             found._require_robot(source, robot)
         return found
@@ -450,61 +393,6 @@ class Trajectory(Frozen):
             )
 
 
-def _require_scene_values(source: Path, values: Mapping[str, Floats], n: int) -> None:
-    """Refuse numbers of a scene that are not finite, or whose shape does not fit n joints."""
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("damping", "stiffness", "rest", "armature"), (n,))
-    shapes |= {"gravity": (3,), "actuation": (n, -1), "center": (-1, 3), "translation": (-1, 3)}
-    shapes |= {"inertia": (-1, 6), "rotation": (-1, 3, 3)}
-    # Others may not be: a noise without a center has NaN there, and a one-sided stop an infinite end.
-    finite = {*shapes, "ratio", "offset", "functions", "noise.constant", "noise.control", "noise.quadratic"}
-    for name, array in values.items():
-        shape = shapes.get(name, array.shape)
-        if array.ndim != len(shape) or any(b not in (-1, a) for a, b in zip(array.shape, shape, strict=True)):
-            raise FileError(f"{source}: scene.{name} has shape {array.shape} instead of {shape}")
-        if name in finite and not np.isfinite(array).all():
-            raise FileError(f"{source}: scene.{name} holds values that are not finite numbers")
-
-
-def chained(parts: Sequence[Trajectory]) -> Trajectory:
-    """Concatenate motions with the same dt, each of which begins at the end of the previous one.
-
-    Their warnings are left out, as the times in them are those of the parts.
-
-    Raises:
-        InputError: Their controls change within steps, at different numbers of stages.
-    """
-    first = parts[0]
-    steps = sum(part.steps for part in parts)
-    arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(first, name)[:1], *(getattr(part, name)[1:] for part in parts)])
-        for name in ("q", "v", "p", "energy")
-    }
-    # The controls of two motions may differ at the node where they meet.
-    arrays["u_nodes"] = np.zeros((steps + 1, 0))
-    of_steps = ("u", "dw", "constraint_forces")
-    arrays |= {name: np.concatenate([getattr(part, name) for part in parts]) for name in of_steps}
-    stages = sorted({part.u_stages.shape[1] for part in parts} - {0})
-    if len(stages) > 1:
-        raise InputError(
-            f"motions whose controls change within steps are chained only if they have the same number of stages, got "
-            f"{' and '.join(map(str, stages))}"
-        )
-    # A control that is constant over a step has the same value at all stages.
-    within = [part.u_stages if part.u_stages.shape[1] or not stages else part.u[:, None].repeat(stages[0], axis=1)
-           for part in parts]  # fmt: skip
-    arrays["u_stages"] = np.concatenate(within)
-    return replace(
-        first,
-        t=first.t[0] + np.arange(steps + 1) * first.dt,
-        **arrays,
-        statistics=joined([part.statistics for part in parts]),
-        warnings=(),
-        accuracy=None,
-        error=None,
-        error_bound=None,
-    )
-
-
 def require_trajectory(motion: object) -> Trajectory:
     """``motion`` itself; an InputError if it is no Trajectory, which names that of a plan or a controller's run."""
     if isinstance(motion, Trajectory):
@@ -515,7 +403,6 @@ def require_trajectory(motion: object) -> Trajectory:
 
 
 def kinematic_input_rows(trajectory: Trajectory) -> Floats:
-    """Rows (k, 2 or more) of a record's ties that are kinematic inputs: joints tied to themselves."""
-    ties = trajectory.scene_values.get("constraints.ties", np.zeros((0, 2)))
-    # A file may have other shapes.
-    return ties[ties[:, 0] == ties[:, 1]] if ties.ndim == 2 and ties.shape[1] > 1 else np.zeros((0, 2))
+    """Rows (joint, joint, rate, ...) of a record's ties that are kinematic inputs: joints tied to themselves."""
+    ties = trajectory.scene_values.get("constraints.ties", np.zeros((0, 3)))
+    return np.asarray(ties[ties[:, 0] == ties[:, 1]], dtype=np.float64)

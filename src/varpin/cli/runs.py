@@ -208,8 +208,7 @@ def _plan_table(
     if refinement is not None and refinement.tried:
         steps = ", ".join(f"{row.dt:g} s" for row in refinement.tried)
         rows.append(("true cost", f"{refinement.tried[refinement.chosen].true_cost:.6g}, of the steps {steps}"))
-    values = solution.trajectory.scene_values
-    unit = "own units" if file.scene.inputs or values["PositionServo"].size else "N m or N"
+    unit = "own units" if file.scene.inputs or file.scene.servo_joints else "N m or N"
     most = np.abs(solution.trajectory.u).max(axis=0, initial=0.0)
     rows += [
         ("wall time", f"{wall_time:.3g} s"),

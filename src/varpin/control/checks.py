@@ -6,6 +6,7 @@ import itertools
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -27,10 +28,9 @@ from varpin.control.noise import covariances, noise_cost
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
 from varpin.control.stages import Feedback, Steps
-from varpin.control.verification import Played, at_start, excess, in_parts, percent, played
+from varpin.control.verification import CLEAR, Played, at_start, excess, in_parts, percent, replays
 from varpin.errors import VarpinError
 from varpin.finding import Finding, announce, ranked
-from varpin.linearization import wrong_variances
 from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import closest_controls
 from varpin.model import (
@@ -41,6 +41,7 @@ from varpin.model import (
     Robot,
     degrees_hint,
     joint_unit,
+    longest_reach,
     looks_like_degrees,
     millimetres_hint,
 )
@@ -48,21 +49,21 @@ from varpin.model.kinematics import FrameKinematics, frame_kinematics
 from varpin.simulation.check import check
 from varpin.simulation.record import rollout
 from varpin.simulation.start import in_other_units
+from varpin.simulation.velocity_noise import wrong_spread
 
 logger = logging.getLogger(__name__)
 
 # Parts of a step in which a plan is played again.
 PARTS = 4
-# Greatest relative excess over the plan's cost, and shortfall, in parts of its steps without a warning.
-LOSS, GAIN = 1e-3, 1e-2
+# Greatest relative excess over the plan's cost in parts of its steps without a warning; of a shortfall it is CLEAR, as
+# of the torque that holds a posture which limits may be short of.
+LOSS = 1e-3
 # Part of the expected cost by which noise may cost other than planned in half steps without a warning.
 _NOISE_OFF = 0.02
 # Standard deviation of a velocity, in widths of its dry friction, up to which tanh is linear to 6 %.
 _LINEAR_FRICTION = 0.25
-# Share of the torque that holds a posture which limits may be short of without a word.
-_SHARE_OF_WEIGHT = 0.01
-# Tolerance on positions and joint limits [m or rad].
-_SAME = 1e-6
+# Angle of a swing under gravity from which on no step follows it [rad]: a quarter of a period.
+_QUARTER = 0.5 * np.pi
 
 
 def looked_at(solution: Solution) -> Solution:
@@ -78,15 +79,14 @@ def looked_at(solution: Solution) -> Solution:
 def findings(solution: Solution) -> tuple[Finding, ...]:
     """Findings about a plan: its limits, its noise, and its cost and constraints within steps."""
     problem, motion = solution.problem, solution.trajectory
-    policy = solution.policy_on("momentum" if problem.integrator.variational else "velocity")
-    of_motion = check(problem.scene, problem.integrator, motion, policy).warnings
+    of_motion = check(problem.scene, problem.integrator, motion, solution.policy).warnings
     found = [*foreseen(problem), *(finding for finding in of_motion if finding.kind != "error")]
     met = solution.refinement is not None and solution.refinement.met
     if solution.refinement is not None and not met:
         found.append(Finding("true cost", solution.refinement.reason))
     found += _noise(solution)
     try:
-        again = _again(solution)
+        again = replays(problem, solution.controls, solution.policy_on, problem.integrator, PARTS)
     except VarpinError as error:
         return *found, Finding("replay", f"the plan cannot be replayed in steps of {1.0 / PARTS:g} dt: {error}")
     found += _between(solution, again)
@@ -102,9 +102,22 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
 def foreseen(problem: OptimalControlProblem) -> list[Finding]:
     """Findings about a problem before any search; where values are in wrong units, these alone."""
     goals = [*_goals(problem)]
-    units = [*in_other_units(problem.scene, problem.q0), *_in_degrees(problem), *_in_millimetres(problem)]
-    units += [own for own in goals if own.kind == "goal in millimetres"]
+    units = [*in_other_units(problem.scene, problem.q0), *_in_milliseconds(problem), *_in_degrees(problem)]
+    units += [*_in_millimetres(problem), *(own for own in goals if own.kind == "goal in millimetres")]
     return [*ranked(units)] or [*_starts_outside(problem), *goals, *_outside(problem), *_weights(problem)]
+
+
+def _in_milliseconds(problem: OptimalControlProblem) -> Iterator[Finding]:
+    """A step in which the stretched arm swings by a quarter of its period under gravity."""
+    robot, pull = problem.scene.robot, float(np.linalg.norm(problem.scene.gravity))
+    length = longest_reach(robot, slides=False)
+    angle = problem.dt * np.sqrt(pull / length) if length > 0.0 else 0.0
+    if angle > _QUARTER:
+        sentence = (
+            f"dt = {problem.dt:g} s may be in milliseconds, and times are in seconds: {robot.name} would swing by "
+            f"{angle:.3g} rad under gravity in one step"
+        )
+        yield Finding("step in milliseconds", sentence, value=problem.dt, unit="s")
 
 
 def _starts_outside(problem: OptimalControlProblem) -> Iterator[Finding]:
@@ -121,12 +134,12 @@ def _starts_outside(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Goals and targets that their frame cannot reach."""
-    robot, places = problem.scene.robot, []
+    robot, places = problem.scene.robot, list[tuple[str, str, Floats, Any]]()
     for term in problem.cost.terms:
         if isinstance(term, FramePositionCost) and not callable(term.target):
             strengths, axes = np.linalg.eigh(weight_matrix("FramePositionCost", term.weight, 3))
-            weighed = axes[:, strengths > _SAME * strengths[-1]]
-            places.append((f"FramePositionCost({term.frame!r})", term.frame, weighed, np.asarray(term.target)))
+            weighed = axes[:, strengths > FEASIBLE * strengths[-1]]
+            places.append((f"FramePositionCost({term.frame!r})", term.frame, weighed, term.target))
     for goal in problem.constraints:
         if isinstance(goal, ReachFrame) and goal.position is not None:
             places.append((goal.label, goal.frame, np.eye(3), goal.position))
@@ -134,15 +147,13 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
         kinematics = frame_kinematics(robot, frame)
         most, root = reach(robot, kinematics), kinematics.links.tree.translation[0]
         away = float(np.linalg.norm((np.atleast_2d(place) - root) @ axes, axis=1).max())
-        if away > most * (1.0 + _SAME):
-            kind, why = "goal out of reach", "no motion gets there"
-            if away > AFAR * most:
-                kind, why = "goal in millimetres", IN_MILLIMETRES
+        if away > most * (1.0 + FEASIBLE):
+            far = away > AFAR * most
             sentence = (
                 f"{label} has its goal {away:.4g} m from the first joint, and the frame gets {most:.4g} m from there "
-                f"at most: {why}"
+                f"at most: {IN_MILLIMETRES if far else 'no motion gets there'}"
             )
-            yield Finding(kind, sentence)
+            yield Finding("goal in millimetres" if far else "goal out of reach", sentence)
 
 
 def reach(robot: Robot, frame: FrameKinematics) -> float:
@@ -175,14 +186,17 @@ def _postures(problem: OptimalControlProblem) -> Iterator[Floats]:
             yield end
 
 
+def _limits(problem: OptimalControlProblem) -> list[WithinJointLimits]:
+    return [item for item in problem.constraints if isinstance(item, WithinJointLimits)]
+
+
 def _outside(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Goal configurations outside of joint limits."""
     robot = problem.scene.robot
-    limits = [item for item in problem.constraints if isinstance(item, WithinJointLimits)]
-    for end, (own, (lower, upper)) in itertools.product(_postures(problem), ((item, item.limits) for item in limits)):
-        beyond = np.maximum(end - upper, lower - end)
+    for end, own in itertools.product(_postures(problem), _limits(problem)):
+        beyond = np.maximum(end - own.limits[1], own.limits[0] - end)
         joint = int(np.argmax(beyond))
-        if beyond[joint] > _SAME:
+        if beyond[joint] > FEASIBLE:
             sentence = (
                 f"the terminal TrackingCost has its goal for {robot.joint_names[joint]} {beyond[joint]:.4g} "
                 f"{joint_unit(robot, joint)} outside {own.label}, where the plan will not end"
@@ -201,7 +215,7 @@ def _weights(problem: OptimalControlProblem) -> Iterator[Finding]:
         needed, (lower, upper) = closest_controls(scene, q), problem.control_limits
         beyond = np.maximum(needed - upper, lower - needed)
         joint = int(np.argmax(beyond))
-        if beyond[joint] > _SHARE_OF_WEIGHT * abs(needed[joint]):
+        if beyond[joint] > CLEAR * abs(needed[joint]):
             sentence = (
                 f"control limits cannot hold the arm at rest at {where}: joint {names[joint]!r} needs "
                 f"{needed[joint]:.3g}, and its limits are {lower[joint]:.3g} and {upper[joint]:.3g}"
@@ -215,16 +229,15 @@ def _in_degrees(problem: OptimalControlProblem) -> Iterator[Finding]:
     for end in _postures(problem):
         if sentence := degrees_hint(robot, "the goal of the terminal TrackingCost", end):
             yield Finding("goal in degrees", sentence)
-    for own in problem.constraints:
-        if isinstance(own, WithinJointLimits):
-            # Limits of the robot's description are in radians, however wide.
-            given = np.isfinite(own.limits) & (own.limits != robot.position_limits) & ~robot.slides
-            most = np.where(given, np.abs(own.limits), 0.0).max(axis=0)
-            joint = int(np.argmax(most))
-            if looks_like_degrees(most[joint]):
-                name = robot.joint_names[joint]
-                sentence = f"{own.label} lets {name} turn to {most[joint]:.4g} rad, and looks like degrees: {ADVICE}"
-                yield Finding("limits in degrees", sentence)
+    for own in _limits(problem):
+        # Limits of the robot's description are in radians, however wide.
+        given = np.isfinite(own.limits) & (own.limits != robot.position_limits) & ~robot.slides
+        most = np.where(given, np.abs(own.limits), 0.0).max(axis=0)
+        joint = int(np.argmax(most))
+        if looks_like_degrees(most[joint]):
+            name = robot.joint_names[joint]
+            sentence = f"{own.label} lets {name} turn to {most[joint]:.4g} rad, and looks like degrees: {ADVICE}"
+            yield Finding("limits in degrees", sentence)
 
 
 def _in_millimetres(problem: OptimalControlProblem) -> Iterator[Finding]:
@@ -266,21 +279,6 @@ def _lengths(constraint: PlanConstraint) -> dict[str, float]:
 # The finished plan
 
 
-def _again(solution: Solution) -> list[Played]:
-    """A plan in parts of its steps, without noise: under its controls alone, and with feedback at its own rate.
-
-    The integrator is the plan's, whose error falls with its order. :meth:`Solution.verify` does the same to many
-    digits, in more time.
-
-    Raises:
-        VarpinError: A custom cost or noise field fails off the plan.
-    """
-    problem, by = solution.problem, solution.problem.integrator
-    fine = problem.in_parts(PARTS)
-    commands = in_parts(problem, solution.controls, solution.policy_on, by, PARTS)
-    return [played(problem, fine, each, by) for each in commands]
-
-
 def _dearer(solution: Solution, again: Sequence[Played]) -> Finding | None:
     """A finding if a plan with feedback costs other than planned in parts of its steps."""
     problem = solution.problem
@@ -288,7 +286,7 @@ def _dearer(solution: Solution, again: Sequence[Played]) -> Finding | None:
     # Where the optimum costs nothing, the excess is relative to the cost at stake at the beginning.
     base = abs(solution.cost) + (1e-9 * first if np.isfinite(first) else 0.0)
     lost = [excess(base + own.cost - solution.cost, base) for own in again]
-    if -GAIN <= lost[1] <= LOSS:
+    if -CLEAR <= lost[1] <= LOSS:
         return None
     alone, fed = (percent(part) if np.isfinite(part) else "runs away" for part in lost)
     advice = f"problem.at(dt={problem.dt / PARTS:g}, hold={problem.hold * PARTS}) decides as often in finer steps"
@@ -340,7 +338,7 @@ def _noise(solution: Solution) -> Iterator[Finding]:
     n = problem.scene.robot.dof
     of_speeds = {own.source.label for own in margins if own.jacobian(motion.q, motion.v)[:, :, n:].any()}
     if of_speeds:
-        for why in wrong_variances(problem.scene, motion, problem.integrator):
+        for why in wrong_spread(problem.scene, problem.integrator, motion):
             sentence = f"the margin= of {', '.join(sorted(of_speeds))} may be wrong: {why}"
             yield Finding("margins of velocities", sentence)
     yield from too_small(solution)

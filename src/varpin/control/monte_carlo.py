@@ -328,7 +328,8 @@ def _mean(parts: Sequence[Found], predicted: float, within: float, problem: Opti
         broken.append(Broken(problem.label_of(bound.source), *where, often, len(good), promised))
     return MonteCarlo(
         cost=float(good.mean()) + within,
-        standard_error=float(good.std(ddof=1) / np.sqrt(len(good))),
+        # Without noise all paths are the same, and differ by rounding.
+        standard_error=float(good.std(ddof=1) / np.sqrt(len(good))) if problem.scene.processes else 0.0,
         predicted=predicted,
         paths=len(good),
         failures=len(found.costs) - len(good),

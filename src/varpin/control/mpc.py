@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,21 +17,20 @@ from varpin.control.constraints import BoundRate
 from varpin.control.costs import CostError
 from varpin.control.history import Status
 from varpin.control.multipliers import REPORTED, ConstraintReport, Multipliers, at_nodes, flat
+from varpin.control.problem import require_problem
 from varpin.control.rollout import first_commands
 from varpin.control.search import Search
-from varpin.errors import InputError, LinearizationError
+from varpin.control.solving import searched
+from varpin.errors import ControlError, InputError, LinearizationError
 from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
-from varpin.integrators.base import Failure
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.scene import Scene, require_scene
-from varpin.mechanics.wiener import generator, wiener_increments
+from varpin.mechanics.wiener import generator
 from varpin.signals.commands import in_parts_of_steps, with_ends
-from varpin.signals.policy import FirstOrderHold
 from varpin.simulation.check import check
 from varpin.simulation.choice import usual_integrator
-from varpin.simulation.failures import Interrupted, StepFailure
-from varpin.simulation.limits import beyond_limits
+from varpin.simulation.failures import StepFailure
 from varpin.simulation.loop import unstable_loop
 from varpin.simulation.record import Progress
 from varpin.simulation.simulate import noise_forgotten, simulate
@@ -39,7 +38,7 @@ from varpin.support.checks import JointValues, control_values, count, positive, 
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, warning_count
 from varpin.support.one_thread import one_thread
-from varpin.trajectory import Nodes, Trajectory, chained
+from varpin.trajectory import Nodes, Trajectory
 
 logger = logging.getLogger(__name__)
 
@@ -57,7 +56,7 @@ class Plant:
         scene: Its scene, with the controls of the planned one; masses, friction and noise may differ.
         integrator: Any of varpin's. By default each run takes the one that :func:`varpin.simulate` chooses at the
             plant's step for the start, all joint stops included; ``motion.integrator`` names it.
-        substeps: Steps per decision of the controller.
+        substeps: Steps per decision of the controller; each holds the mean of a line of linear controls.
     """
 
     scene: Scene
@@ -135,12 +134,11 @@ class MpcRun(Frozen):
 
     @property
     def _summary(self) -> str:
-        text = f"{len(self.plans)} ticks of {1e3 * self.period:.3g} ms"
-        if len(self.seconds) > 1:
-            milliseconds = 1e3 * self.seconds[1:]
+        text, took = f"{len(self.plans)} ticks of {1e3 * self.period:.3g} ms", 1e3 * self.seconds[1:]
+        if took.size:
             text += (
-                f": planning took {milliseconds.mean():.2f} ms in the mean, {np.quantile(milliseconds, 0.95):.2f} in "
-                f"95%, {milliseconds.max():.2f} at most, for {self.iterations[1:].mean():.2f} iterations a tick"
+                f": planning took {took.mean():.2f} ms in the mean, {np.quantile(took, 0.95):.2f} in 95%, "
+                f"{took.max():.2f} at most, for {self.iterations[1:].mean():.2f} iterations a tick"
             )
         if self.budget < np.inf:
             text += f"; {int(self.late.sum())} later than {1e3 * self.budget:.3g} ms"
@@ -165,15 +163,12 @@ class Mpc:
     evaluated at the plant's time: the horizon recedes. Costs and limits of changes of the controls start from the last
     applied control.
 
-    Where the problem's controls are linear between nodes, they follow the plan's first line over the tick. The next
-    plan's line begins at a control of its own, which reacts to the measured state at once; a
-    :class:`ControlRateCost` makes the jump between the two small.
+    Controls that are linear between nodes follow the plan's first line over the tick. The next plan's line begins at a
+    control of its own, which reacts to the measured state at once; a :class:`ControlRateCost` makes the jump small.
 
-    Constraints hold along every horizon, and moving obstacles are predicted. Each iteration of a tick meets their
-    linearization, so a plan satisfies them to the accuracy of few iterations, which ``Solution.violation`` has. A goal
-    (:class:`ReachFrame`) applies to the end of every horizon. The size of a margin is that of the first plan. After the
-    first plan constraints also hold in the middles of steps with ``between_nodes`` or linear controls, and else at the
-    nodes.
+    Constraints hold along every horizon to the accuracy of few iterations, which ``Solution.violation`` has; a goal
+    (:class:`ReachFrame`) applies to the end of every horizon. The size of a margin is that of the first plan. After it
+    constraints also hold in the middles of steps with ``between_nodes`` or linear controls, and else at the nodes.
 
     Main args:
         problem: The problem. Its horizon, discretization, noise, limits and constraints apply to every tick, its
@@ -194,25 +189,16 @@ class Mpc:
     budget: float = np.inf
 
     def __post_init__(self) -> None:
-        if not isinstance(self.problem, OptimalControlProblem):
-            raise InputError(f"problem must be an OptimalControlProblem, got {type(self.problem).__name__}")
+        require_problem(self.problem)
         count("iterations", self.iterations, least=1)
         positive("tolerance", self.tolerance, "1")
         if self.budget != np.inf:
             positive("budget", self.budget, "s")
 
-    def _repr_html_(self) -> str:
-        rows = [
-            ("period", f"{1e3 * self.period:.3g} ms"),
-            ("iterations", f"{self.iterations} a tick"),
-            ("budget", "any time" if self.budget == np.inf else f"{1e3 * self.budget:.3g} ms"),
-        ]
-        return facts("Model predictive control", rows, self.problem._repr_html_())
-
     @property
     def period(self) -> float:
         """Time of a tick: how long a decision is held, or the line between two decisions lasts [s]."""
-        return self.problem.dt * self.problem.hold
+        return self.problem.period
 
     def plan(
         self,
@@ -263,12 +249,8 @@ class Mpc:
             search.weight = previous.search.weight
         if previous.multipliers is not None and problem.constraints:
             search.take(_margins(problem, previous, previous.multipliers))
-        try:
-            status = search.run(self.tolerance, self.iterations, deadline, lambda *_: None)
-        except KeyboardInterrupt:
-            status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
         # A tick does not check its plan; the run checks the motion that results.
-        return search.solution(status)
+        return searched(search, self.tolerance, self.iterations, deadline, lambda *_: None)
 
     @one_thread()
     def run(
@@ -283,7 +265,7 @@ class Mpc:
 
         In each tick the first decision of the plan made from the state at its beginning acts, or, where controls are
         linear between nodes, the line between its first two. The first plan is made before the run. Where a search
-        finds no plan in time, the one before acts on with its feedback, up to its end.
+        finds no plan in time, the one before acts on with its feedback, and at its end the last control is held.
 
         Main args:
             plant: None for the problem's own scene, integrated more finely.
@@ -297,50 +279,51 @@ class Mpc:
 
         Raises:
             InputError: A plant with other controls or joints.
-            StepFailure: The plant's motion cannot be integrated. Or all ticks of a plan's horizon were late or without
-                a plan; its cause is the last search's error, if that raised one. It holds the plant's motion so far.
+            StepFailure: The plant's motion cannot be integrated; it holds the motion so far.
             CostError: A custom cost fails; from the second tick on it holds the plant's motion so far.
             Interrupted: Ctrl-C; holds the plant's motion so far. In the first plan, a plain KeyboardInterrupt.
         """
-        report: Any = progress
-        moving = told_motion("progress", progress, "ticks done, ticks in all", "nodes")
         plant = Plant(self.problem.scene) if plant is None else plant
         if not isinstance(plant, Plant):
             raise InputError(f"plant must be a varpin.Plant, for example varpin.Plant(scene), got {plant!r}")
         _require_fit(plant.scene, self.problem.scene)
         ticks = max(1, round(positive("duration", duration, "s") / self.period))
-        loop = _Loop(self, plant, None if rng is None else generator(rng))
+        drawn = None if rng is None else generator(rng)
+        loop = _Loop(self, plant, ticks, progress)
+        scene, start, dt = plant.scene, (self.problem.q0, self.problem.v0), self.period / plant.substeps
+        noisy = drawn is not None and scene.processes > 0
+        method = plant.integrator or usual_integrator(scene, *start, dt, noisy=noisy)
+        given: dict[str, Any] = {"dt": dt, "steps": ticks * plant.substeps, "integrator": method}
+        given |= {"rng": drawn} if noisy else {"increments": 0.0}
         try:
-            for tick in range(ticks):
-                if tick > 0:
-                    loop.replan()
-                nodes = loop.act()
-                if report is not None:
-                    report(tick + 1, ticks, *([nodes] if moving else []))
-        except KeyboardInterrupt:
-            if not loop.parts:
-                raise
-            raise Interrupted(loop.motion()) from None
+            # The run is checked, and its findings logged, at the end.
+            motion = simulate(scene, *start, controls=loop, check=False, **given)
+        except ControlError as error:
+            cause = error.__cause__
+            if isinstance(cause, CostError):
+                raise CostError(cause.cost, cause.problem, error.trajectory) from cause
+            raise cause or error from None
+        loop.report(motion.t[-1], motion.q[-1], motion.v[-1])
         # The controller corrects the errors of a tick in the next.
-        motion = check(plant.scene, loop.method, chained(loop.parts), restart=plant.substeps)
+        motion = check(scene, method, motion.changed(warnings=()), restart=plant.substeps)
         constraints, violated = loop.constraints(motion)
         found = (
-            *noise_forgotten(plant.scene, rng),
-            *unstable_loop(plant.scene, motion, plant.substeps),
+            *noise_forgotten(scene, rng),
+            *unstable_loop(scene, motion, plant.substeps),
             *motion.warnings,
             *loop.without_plans(),
             *violated,
         )
-        announce(logger, plant.scene.announced, loop.dt, found)
+        announce(logger, scene.announced, dt, found)
         again = {(finding.kind, finding.joint) for finding in found}
-        first = (finding for finding in loop.plans[0].warnings if (finding.kind, finding.joint) not in again)
+        first = (finding for finding in loop.ticks[0].plan.warnings if (finding.kind, finding.joint) not in again)
         return MpcRun(
             motion,
-            tuple(loop.plans),
-            np.array(loop.seconds),
-            np.array(loop.iterations, dtype=np.int64),
-            np.array(loop.late),
-            np.array(loop.failed),
+            tuple(tick.plan for tick in loop.ticks),
+            np.array([tick.seconds for tick in loop.ticks]),
+            np.array([tick.iterations for tick in loop.ticks], dtype=np.int64),
+            np.array([tick.late for tick in loop.ticks]),
+            np.array([bool(tick.failure) for tick in loop.ticks]),
             self.period,
             self.budget,
             constraints=constraints,
@@ -348,110 +331,107 @@ class Mpc:
         )
 
 
+class _Tick(NamedTuple):
+    """The plan that acts in a tick, which decision of it, and how planning went."""
+
+    plan: Solution
+    age: int = 0
+    seconds: float = 0.0
+    iterations: int = 0
+    late: bool = False
+    failure: str = ""  # why there is no plan in time; empty if there is one, or it is late
+
+
 class _Loop:
-    """A controller and its plant: the state at the beginning of a tick, and the ticks before."""
+    """A controller as the control law of its plant: at the beginning of each tick a plan, within it a decision."""
 
-    def __init__(self, controller: Mpc, plant: Plant, rng: np.random.Generator | None) -> None:
-        problem = controller.problem
-        self.controller, self.problem, self.plant, self.rng = controller, problem, plant, rng
-        self.dt = controller.period / plant.substeps
-        self.active, self.age = solve(problem, tolerance=controller.tolerance), 0
-        if self.active.status is Status.INTERRUPTED or any(told.kind == "interrupted" for told in self.active.warnings):
+    def __init__(self, controller: Mpc, plant: Plant, ticks: int, progress: Progress | None) -> None:
+        self.controller, self.problem, self.plant = controller, controller.problem, plant
+        self.count, self.progress = ticks, progress
+        self.moving = told_motion("progress", progress, "ticks done, ticks in all", "nodes")
+        self.ticks = [_Tick(solve(self.problem, tolerance=controller.tolerance))]
+        plan = self.ticks[0].plan
+        if plan.status is Status.INTERRUPTED or any(told.kind == "interrupted" for told in plan.warnings):
             raise KeyboardInterrupt
-        self.q, self.v, self.applied = problem.q0, problem.v0, problem.before
-        noisy = rng is not None and plant.scene.processes > 0
-        self.method = plant.integrator or usual_integrator(plant.scene, self.q, self.v, self.dt, noisy=noisy)
-        self.parts: list[Trajectory] = []
-        self.plans: list[Solution] = []
-        self.seconds, self.iterations, self.late, self.failed = [0.0], [0], [False], [False]
-        self.reasons: list[str] = []
+        self.applied = self.problem.before
+        self.nodes: list[tuple[float, Floats, Floats]] = []  # of the tick so far
+        self.rows = np.zeros((0, plant.scene.controls))  # controls of its steps
 
-    def replan(self) -> None:
+    def __call__(self, t: float, q: Floats, v: Floats) -> Floats:
+        """The control (m,) of the plant's next step, at time ``t`` since the beginning of the run [s]."""
+        if len(self.nodes) == self.plant.substeps:
+            self.report(t, q, v)
+            self.replan(t, q, v)
+        if not self.nodes:
+            self.decide(q, v)
+        self.nodes.append((t, q, v))
+        return np.asarray(self.rows[len(self.nodes) - 1])
+
+    def report(self, t: float, q: Floats, v: Floats) -> None:
+        """Tell of a tick that has ended at time ``t`` [s]."""
+        told: Any = self.progress
+        nodes, self.nodes = Nodes(*map(np.array, zip(*self.nodes, (t, q, v), strict=True))), []
+        if told is not None:
+            told(len(self.ticks), self.count, *([nodes] if self.moving else []))
+
+    def replan(self, t: float, q: Floats, v: Floats) -> None:
         """Plan from the present state; where there is no plan in time, the one before acts on."""
-        begin, fresh, failure = time.perf_counter(), None, None
-        t = self.problem.t0 + len(self.parts) * self.controller.period
+        begin, fresh, failure, last = time.perf_counter(), None, "", self.ticks[-1]
         before = self.applied if self.problem.remembers else None
         try:
-            fresh = self.controller.plan(t, self.q, self.v, self.active, self.age + 1, before)
+            fresh = self.controller.plan(self.problem.t0 + t, q, v, last.plan, last.age + 1, before)
         except (StepFailure, LinearizationError, NoiseFieldError) as error:
-            failure = error
-        except CostError as error:
-            raise CostError(error.cost, error.problem, self.motion()) from error
+            failure = str(error)
         if fresh is not None and fresh.status is Status.INTERRUPTED:
             # A search keeps its best plan and returns; the run is what Ctrl-C is to end.
             raise KeyboardInterrupt
-        self.seconds.append(time.perf_counter() - begin)
-        self.iterations.append(0 if fresh is None else fresh.iterations)
-        # A late plan does not act, whether or not there is one. Without gains a search has found none.
-        self.late.append(self.seconds[-1] > self.controller.budget)
-        self.failed.append(not self.late[-1] and (fresh is None or bool(np.isnan(fresh.gradient).all())))
-        if self.failed[-1]:
-            self.reasons.append(str(failure) if fresh is None else fresh.reason)
-        if fresh is not None and not (self.late[-1] or self.failed[-1]):
-            self.active, self.age = fresh, 0
-            return
-        self.age += 1
-        if self.age >= len(self.active.gains) - self.problem.linear:
-            motion = self.motion()
-            why = f"it took {self.seconds[-1]:.3g} s" if self.late[-1] else self.reasons[-1]
-            told = Failure(f"no plan can be made from here in time, and the last plan is at its end; {why}", np.nan)
-            advice = "Use a longer horizon, a larger budget, or more iterations a tick"
-            raise StepFailure(motion.steps, motion.t[-1], told, motion, advice) from failure
+        seconds, iterations = time.perf_counter() - begin, 0 if fresh is None else fresh.iterations
+        if fresh is not None and np.isnan(fresh.gradient).all():
+            # Without gains a search has found no plan.
+            failure, fresh = fresh.reason, None
+        late = seconds > self.controller.budget
+        plan, age = (last.plan, last.age + 1) if late or fresh is None else (fresh, 0)
+        self.ticks.append(_Tick(plan, age, seconds, iterations, late, "" if late else failure))
 
-    def act(self) -> Nodes:
-        """Apply the present decision of the active plan over a tick; the plant's motion in it."""
-        self.plans.append(self.active)
-        before = self.applied
-        if self.problem.linear and self.age == 0:
+    def decide(self, q: Floats, v: Floats) -> None:
+        """Make the controls of a tick: the decision of the plan that acts, or the line to it, at means of the steps."""
+        (plan, age, *_), scene, before, substeps = self.ticks[-1], self.plant.scene, self.applied, self.plant.substeps
+        if self.problem.linear and age == 0:
             # A fresh plan begins at the measured state; one that acts on, where the line before ended.
-            before = self.active.controls[0]
-        self.applied = _decision(self.active, self.age, np.concatenate([self.q, self.v]), before)
-        scene, substeps = self.plant.scene, self.plant.substeps
+            before = plan.controls[0]
+        self.applied = _decision(plan, age, np.concatenate([q, v]), before)
         # Joints with kinematic inputs move on one line or cubic to their next positions over the tick.
-        controls: Any = in_parts_of_steps(
-            scene, self.applied[None], self.q[None], self.v[None], self.controller.period, substeps
-        )
+        self.rows = in_parts_of_steps(scene, self.applied[None], q[None], v[None], self.controller.period, substeps)
         if self.problem.linear and before is not None:
-            line = FirstOrderHold(np.vstack([before, self.applied])).refined(substeps).u
-            controls = FirstOrderHold(np.vstack([line[:1], with_ends(scene, line[1:], controls)]))
-        drawn = wiener_increments(scene.processes, self.dt, substeps, self.rng)
-        options: dict[str, Any] = {"dt": self.dt, "steps": substeps, "controls": controls, "integrator": self.method}
-        options["increments"] = drawn if len(drawn) else 0.0
-        try:
-            # The whole run is checked, and its findings logged, at the end.
-            part = simulate(scene, self.q, self.v, **options, check=False)
-        except StepFailure as failure:
-            self.parts.append(failure.trajectory)
-            whole = self.motion()
-            cause = Failure(failure.reason, failure.residual)
-            raise StepFailure(whole.steps, whole.t[-1], cause, whole) from None
-        nodes = Nodes(len(self.parts) * self.controller.period + part.t, part.q, part.v)
-        self.parts.append(part)
-        self.q, self.v = part.q[-1], part.v[-1]
-        return nodes
-
-    def motion(self) -> Trajectory:
-        """The plant's motion so far, with its warnings and those of ticks without a plan."""
-        motion = chained(self.parts)
-        return motion.changed(warnings=(*beyond_limits(self.plant.scene, motion), *self.without_plans()))
+            share = (np.arange(substeps)[:, None] + 0.5) / substeps
+            self.rows = with_ends(scene, before + share * (self.applied - before), self.rows)
 
     def without_plans(self) -> list[Finding]:
         """Warnings if more than a few plans took longer than the budget or the period, or searches found no plan."""
-        seconds, limit = np.array(self.seconds[1:]), min(self.controller.period, self.controller.budget)
-        slow, found = int((seconds > limit).sum()), []
-        if slow > _FEW * len(seconds):
+        ticks, period, found = self.ticks[1:], self.controller.period, []
+        seconds, limit = np.array([tick.seconds for tick in ticks]), min(period, self.controller.budget)
+        slow, failed = int((seconds > limit).sum()), [tick.failure for tick in ticks if tick.failure]
+        if slow > _FEW * len(ticks):
             text = (
-                f"planning took longer than {1e3 * limit:.3g} ms in {slow} of {len(seconds)} ticks "
+                f"planning took longer than {1e3 * limit:.3g} ms in {slow} of {len(ticks)} ticks "
                 f"({1e3 * seconds.mean():.3g} ms in the mean). Use fewer steps, fewer iterations, a larger budget or a "
                 "longer period (hold=)"
             )
             found.append(Finding("late plans", text))
-        if self.reasons:
+        if failed:
+            first = [bool(tick.failure) for tick in self.ticks].index(True) * period
             text = (
-                f"in {sum(self.failed)} of {len(seconds)} ticks no plan was found and an older one acted, at t = "
-                f"{self.failed.index(True) * self.controller.period:.4g} s for the first time: {self.reasons[0]}"
+                f"in {len(failed)} of {len(ticks)} ticks no plan was found and an older one acted, at t = {first:.4g} "
+                f"s for the first time: {failed[0]}"
             )
             found.append(Finding("failed ticks", text))
+        ended = [tick.age >= _lines(tick.plan) for tick in self.ticks]
+        if any(ended):
+            text = (
+                f"no plan came for a whole horizon, and from t = {ended.index(True) * period:.4g} s on the last "
+                "control was held: use a longer horizon, a larger budget, or more iterations a tick"
+            )
+            found.append(Finding("plan at its end", text))
         return found
 
     def constraints(self, motion: Trajectory) -> tuple[tuple[ConstraintReport, ...], list[Finding]]:
@@ -459,11 +439,12 @@ class _Loop:
         problem, reports, found = self.problem, [], []
         # A plant's motion has the means of lines over its steps.
         hold = 1 if problem.linear else self.plant.substeps
-        violated = np.array([_violated(plan) for plan in self.plans])
+        plans = [tick.plan for tick in self.ticks]
+        violated = np.array([_violated(plan) for plan in plans])
         for i, bound in enumerate(problem.constraints_on(motion.dt, motion.steps, hold, linear=False)):
             label = problem.label_of(bound.source)
             if violated[:, i].any():
-                planned = [plan.constraints[i].violation for plan in self.plans]
+                planned = [plan.constraints[i].violation for plan in plans]
                 tick = int(np.argmax(planned))
                 text = (
                     f"in {int(violated[:, i].sum())} of {len(planned)} ticks no plan was found that keeps to {label}; "
@@ -502,12 +483,20 @@ def _require_fit(plant: Scene, planned: Scene) -> None:
             raise InputError(f"the plant has other {what} than the problem: {of(plant)}, not {of(planned)}")
 
 
+def _lines(plan: Solution) -> int:
+    """How many ticks a plan lasts."""
+    return plan.problem.decisions - plan.problem.linear
+
+
 def _decision(plan: Solution, age: int, x: Floats, before: Floats | None) -> Floats:
     """Control (m,) of the plan's decision ``age`` with feedback at the state x = (q, v), after the control ``before``.
 
     Where controls are linear between nodes it is the control at the end of the tick, and ``before`` that at its begin.
     """
-    u = plan.policy_on("velocity").control(age, x, before)
+    if age < _lines(plan):
+        u = plan.policy_on("velocity").control(age, x, before)
+    else:
+        u = plan.shifted(plan.problem.decisions - 1, x="velocity").control(0, x, before)
     for bound in plan.problem.bound_constraints:
         if isinstance(bound, BoundRate) and before is not None:
             most = bound.limit * bound.period

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,28 +60,26 @@ Sampling = Literal["midpoint", "gauss", "start"]
 Shape = Literal["held", "linear"]
 
 # Greatest rate of dampers and dry friction, times the step, for a method that is not L-stable.
-_STIFF = 10.0
+STIFF = 10.0
 # Stages of the default integrator. Two match the cost's order; four resolve friction up to ten times as fast as the
 # step, for a third more time.
 STAGES = 4
 # Greatest natural frequency of the feedback of first motions, times the period of controls; from 0.1 to 0.5. Singular
 # values of the constraints that are rounding errors, relative to the largest; from 1e-12 to 1e-6.
-_FASTEST, _SINGULAR = 0.25, 1e-9
-# Longest value in a message of a difference, in characters.
-_SHORT = 60
+FASTEST, _SINGULAR = 0.25, 1e-9
+# Arguments of a problem that another state, time or control before the horizon may change.
+_MOVED = {"q0", "v0", "t0"}
+_GRID = ("dt", "steps", "integrator", "sampling", "hold", "controls", "between_nodes")
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class OptimalControlProblem(Frozen):
-    """Minimize the expected cost of a motion from (q0, v0) over the controls, each held over ``hold`` steps.
+    """Minimize the expected cost of a motion from (q0, v0), (O1), over the controls, each held over ``hold`` steps.
 
-    The expected cost is (O1). With ``controls="linear"`` controls are linear in time between the nodes, with one
-    decision at each node, the first one included. Smooth motions then need a fraction of the nodes. Limits hold at the
-    nodes, and so everywhere.
-
-    Running costs are integrals in time, sampled in each step, and references are functions of time, so the problem is
-    the same at every ``dt``. Controls stay within their limits, feedback included. Costs add up, and numbers scale
-    them:
+    With ``controls="linear"`` controls are linear in time between the nodes, with one decision at each node, the first
+    one included. Smooth motions then need a fraction of the nodes. Controls stay within their limits, feedback
+    included. Running costs are integrals in time, and references are functions of time, so the problem is the same at
+    every ``dt``. Costs add up, and numbers scale them:
 
         cost = vp.TrackingCost(reference, 10.0) + vp.ControlCost(0.1) + vp.Terminal(2.0 * vp.TrackingCost(goal))
 
@@ -101,17 +99,15 @@ class OptimalControlProblem(Frozen):
             ``Gauss(stages=4)``. All with ``kick="held"`` where the scene has noise.
         sampling: Where in each step running costs are sampled. ``"gauss"``, the default: at its two Gauss points, with
             a cubic motion between the nodes, of fourth order; at four points where a :class:`varpin.KinematicInput` is
-            cubic. ``"midpoint"``: at ((q + q')/2, (q' - q)/dt, u), of second order; it is blind to velocities that
-            alternate from node to node, as optimal ones often do. ``"start"``: at the step's first node, a left sum as
-            in the paper, of first order.
+            cubic. ``"midpoint"``: at ((q + q')/2, (q' - q)/dt, u), of second order, and blind to velocities that
+            alternate from node to node. ``"start"``: at the step's first node, as in the paper, of first order.
         hold: Steps that share one control: a digital controller's period over the integrator's step.
         t0: Time at the beginning of the horizon [s], for references that are functions of time.
         control_limits: Least and greatest control (2, m) [N m or N per unit of control], infinite where there is none;
             of a :class:`varpin.KinematicInput` its positions at nodes.
         controls: ``"held"``, each constant over ``hold`` steps, or ``"linear"`` in time between nodes.
         constraints: Hard constraints on the motion (:class:`PlanConstraint`): joint limits, a frame's goal, regions,
-            clearance. The constraints of a :class:`Scene` differ: they belong to the mechanism, and constraint forces
-            maintain them in every motion.
+            clearance. Those of a :class:`Scene` belong to the mechanism.
         between_nodes: Whether the constraints are to hold between nodes, too, which takes more time. Linear controls
             keep them there anyway, to a thousandth of their range.
         integrator_by_default: Whether ``integrator`` was left out; :meth:`at` then chooses it anew.
@@ -167,11 +163,9 @@ class OptimalControlProblem(Frozen):
 
         Raises:
             UnknownJoint: An unknown joint name, or one of a joint that is not driven, for controls.
-            InputError: Wrong shapes, values that are not finite, not two of ``dt``, ``steps`` and ``duration``, a
-                duration that is no multiple of ``dt``, steps that are no multiple of ``hold``, a reference that does
-                not fit the problem's grid, or a lower limit above the upper one; linear controls with ``hold``;
-                ``hold`` with a :class:`KinematicInput`; another ``sampling`` than "gauss" with a cubic one, or with
-                linear controls; constraints that are no plan constraints or of another robot.
+            InputError: Wrong shapes or values; not two of ``dt``, ``steps`` and ``duration``; ``hold`` with linear
+                controls or a :class:`KinematicInput`; another ``sampling`` than "gauss" with linear controls or a cubic
+                input; a reference that does not fit the grid; constraints that are of another robot.
             CostError: A reference function fails.
             AssemblyError: The scene's constraints cannot be satisfied near q0.
         """
@@ -188,50 +182,51 @@ class OptimalControlProblem(Frozen):
             raise InputError(f"steps = {steps} is no multiple of hold = {hold}")
         word("sampling", sampling, ("midpoint", "gauss", "start"))
         word("controls", controls, ("held", "linear"))
-        linear, cubic = controls == "linear", max(scene.rates, default=-1) >= 0
+        linear = controls == "linear"
         if hold != 1 and (linear or scene.inputs):
             what = "linear controls" if linear else "positions of a KinematicInput"
             raise InputError(f"{what} are decided at every node: leave hold = {hold} out", "hold")
-        if sampling != "gauss" and (linear or cubic):
+        if sampling != "gauss" and (linear or _cubic(scene)):
             what = "linear controls act" if linear else "a cubic KinematicInput acts"
             raise InputError(
                 f"sampling = {sampling!r} misses the nodes, where {what}: leave it out, for 'gauss'", "sampling"
             )
-        t0, (places, rule) = finite("t0", t0), _rule(sampling, dt, cubic=cubic)
-        times, names = t0 + _times(places, steps, dt), scene.robot.joint_names
-        points = Points(times, dt * steps, steps, n, m, t0, names, scene.control_joints, scene.robot)
-        running, terminal = bind_cost(cost, times, points)
+        t0, names = finite("t0", t0), scene.robot.joint_names
         at, speed = joint_array("q0", q0, names), joint_array("v0", v0, names)
         if scene.constraints:
             at, speed, moved = on_constraints(scene, at, speed)
             announce(logger, scene.announced, dt, moved)
         note = "; those of the mechanism belong to varpin.Scene(constraints=)"
-        values = {
-            "scene": scene,
-            "cost": cost,
-            "q0": at,
-            "v0": speed,
-            "dt": dt,
-            "steps": steps,
-            "integrator": integrator_for(scene, at, dt) if integrator is None else integrator,
-            "sampling": sampling,
-            "hold": hold,
-            "t0": t0,
-            "control_limits": named_limits("control_limits", control_limits, scene.control_joints, m),
-            "constraints": tuple_of("constraints", constraints, PlanConstraint, note),
-            "running": running,
-            "terminal": terminal,
-            "places": places,
-            "rule": rule,
-            "rate": control_rate(cost, m, scene.control_joints),
-            "controls": controls,
-            "between_nodes": flag("between_nodes", between_nodes),
-            "integrator_by_default": integrator is None,
-        }
-        for value in (at, speed, places, rule):
-            value.setflags(write=False)
-        vars(self).update(values)
-        vars(self)["bound_constraints"] = self.constraints_on(dt, steps, hold)
+        vars(self).update(
+            scene=scene,
+            cost=cost,
+            q0=at,
+            v0=speed,
+            dt=dt,
+            steps=steps,
+            integrator=integrator_for(scene, at, dt) if integrator is None else integrator,
+            sampling=sampling,
+            hold=hold,
+            t0=t0,
+            control_limits=named_limits("control_limits", control_limits, scene.control_joints, m),
+            constraints=tuple_of("constraints", constraints, PlanConstraint, note),
+            controls=controls,
+            between_nodes=flag("between_nodes", between_nodes),
+            integrator_by_default=integrator is None,
+        )
+        self._bind(Points(np.zeros(0), dt * steps, steps, n, m, t0, names, scene.control_joints, scene.robot))
+
+    def _bind(self, points: Points, known: tuple[BoundSum, BoundSum] | None = None) -> Self:
+        """Bind costs and constraints to the grid; of ``known`` costs, those that do not depend on time are reused."""
+        places, rule = _rule(self.sampling, self.dt, cubic=_cubic(self.scene))
+        times = self.t0 + ((np.arange(self.steps, dtype=np.float64)[:, None] + places) * self.dt).reshape(-1)
+        running, terminal = bind_cost(self.cost, times, points, known)
+        rate = control_rate(self.cost, self.scene.controls, self.scene.control_joints)
+        vars(self).update(places=places, rule=rule, running=running, terminal=terminal, rate=rate)
+        vars(self)["bound_constraints"] = self.constraints_on(self.dt, self.steps, self.hold)
+        for array in (self.q0, self.v0, places, rule):
+            array.setflags(write=False)
+        return self
 
     def __repr__(self) -> str:
         held = f", each control held over {self.hold}" if self.hold > 1 else ", linear controls" if self.linear else ""
@@ -303,27 +298,16 @@ class OptimalControlProblem(Frozen):
         """The time that each control holds [s]."""
         return self.dt * self.hold
 
-    def at(
-        self,
-        *,
-        q0: JointValues | None = None,
-        v0: JointValues | None = None,
-        dt: float | None = None,
-        steps: int | None = None,
-        duration: float | None = None,
-        integrator: Integrator | None = None,
-        sampling: Sampling | None = None,
-        hold: int | None = None,
-        t0: float | None = None,
-        before: JointValues | None = None,
-        controls: Shape | None = None,
-        between_nodes: bool | None = None,
-    ) -> OptimalControlProblem:
-        """The same problem with another discretization or initial state.
+    def at(self, *, before: JointValues | None = None, **changes: Any) -> OptimalControlProblem:
+        """The same problem with other arguments: another discretization, initial state, cost, ...
 
         With ``dt`` alone the horizon stays, and with ``duration`` alone the step; the number of steps follows. An
-        integrator that was left out is chosen anew for the step and the state. ``before`` is the control applied before
-        the horizon, one number, (m,) or by joint name, for :class:`ControlRateCost` and :class:`WithinControlRate`.
+        integrator that was left out is chosen anew for the step and the state.
+
+        Args:
+            before: The control applied before the horizon, one number, (m,) or by joint name, for
+                :class:`ControlRateCost` and :class:`WithinControlRate`.
+            changes: Any arguments of the problem but the scene; None leaves one as it is.
 
         Raises:
             InputError: The horizon is no multiple of ``dt``; ``before`` is given where changes of controls have
@@ -331,24 +315,24 @@ class OptimalControlProblem(Frozen):
         """
         if before is not None and not self.remembers:
             raise InputError("before is what a ControlRateCost or a WithinControlRate begins with: give one")
-        if dt is not None and steps is None and duration is None:
-            duration = self.duration
-        if duration is not None:
-            dt, steps = time_steps(self.dt if dt is None and steps is None else dt, steps, duration)
-        moved: dict[str, Any] = {"q0": q0, "v0": v0, "t0": t0}
-        grid: dict[str, Any] = {"dt": dt, "steps": steps, "integrator": integrator, "sampling": sampling, "hold": hold}
-        grid |= {"controls": controls, "between_nodes": between_nodes}
+        given = {name: value for name, value in changes.items() if value is not None}
+        if "dt" in given and not given.keys() & {"steps", "duration"}:
+            given["duration"] = self.duration
+        if "duration" in given:
+            dt, steps = given.get("dt", None if "steps" in given else self.dt), given.get("steps")
+            given["dt"], given["steps"] = time_steps(dt, steps, given.pop("duration"))
+        moves = given.keys() <= _MOVED
         if before is not None:
             control = control_values("before", before, self.scene.control_joints, self.scene.controls)
-            moved["cost"] = with_control_before(self.cost, control)
-            moved["constraints"] = tuple(item.after(control) for item in self.constraints)
-        changed, other = ({k: x for k, x in given.items() if x is not None} for given in (moved, grid))
-        if not other:
-            return self._moved(changed)
-        same = {name: getattr(self, name) for name in (*moved, *grid, "cost", "constraints", "control_limits")}
+            given["cost"] = with_control_before(given.get("cost", self.cost), control)
+            kept = tuple_of("constraints", given.get("constraints", self.constraints), PlanConstraint)
+            given["constraints"] = tuple(item.after(control) for item in kept)
+        if moves:
+            return self._moved(given)
+        same = {name: getattr(self, name) for name in (*_MOVED, *_GRID, "cost", "constraints", "control_limits")}
         if self.integrator_by_default:
             same["integrator"] = None
-        return OptimalControlProblem(self.scene, **same | changed | other)
+        return OptimalControlProblem(self.scene, **same | given)
 
     def _moved(self, changed: dict[str, Any]) -> OptimalControlProblem:
         """The problem on the same grid, from another state, time or control; only what depends on them is rebuilt."""
@@ -357,20 +341,14 @@ class OptimalControlProblem(Frozen):
         if state and scene.constraints:
             at = {"q0": self.q0, "v0": self.v0} | state
             state["q0"], state["v0"], _ = on_constraints(scene, at["q0"], at["v0"])
+        if "t0" in changed:
+            changed["t0"] = finite("t0", changed["t0"])
+        found = self.changed(**changed | state)
         for array in state.values():
             array.setflags(write=False)
-        changed = changed | state
-        if "cost" in changed:
-            changed["rate"] = control_rate(changed["cost"], scene.controls, scene.control_joints)
-        if "t0" in changed:
-            changed["t0"] = t0 = finite("t0", changed["t0"])
-            times = t0 + _times(self.places, self.steps, self.dt)
-            points = replace(self.running.points, t=times, t0=t0)
-            changed["running"], changed["terminal"] = bind_cost(self.cost, times, points, (self.running, self.terminal))
-        found = self.changed(**changed)
-        if self.constraints and ("constraints" in changed or "t0" in changed):
-            vars(found)["bound_constraints"] = found.constraints_on(found.dt, found.steps, found.hold)
-        return found
+        if changed.keys() <= {"q0", "v0"}:
+            return found
+        return found._bind(replace(self.running.points, t0=found.t0), (self.running, self.terminal))
 
     def in_parts(self, parts: int) -> OptimalControlProblem:
         """The problem in ``parts`` of each step, for motions under commands that are decided as in its own steps.
@@ -378,21 +356,8 @@ class OptimalControlProblem(Frozen):
         Costs are sampled by the rule "gauss". It is not to be solved: the controls of kinematic inputs, and linear
         ones, are those of the parts.
         """
-        dt, steps = self.dt / parts, self.steps * parts
-        places, rule = _rule("gauss", dt, cubic=max(self.scene.rates, default=-1) >= 0)
-        times = self.t0 + _times(places, steps, dt)
-        running, terminal = bind_cost(self.cost, times, self.running.points)
-        return self.changed(
-            dt=dt,
-            steps=steps,
-            hold=1 if self.linear else self.hold * parts,
-            sampling="gauss",
-            places=places,
-            rule=rule,
-            running=running,
-            terminal=terminal,
-            bound_constraints=self.constraints_on(dt, steps, self.hold * parts),
-        )
+        given = {"dt": self.dt / parts, "steps": self.steps * parts, "hold": self.hold * parts, "sampling": "gauss"}
+        return self.changed(**given)._bind(self.running.points)
 
     @cached_property
     def setting(self) -> dict[str, Any]:
@@ -421,10 +386,10 @@ class OptimalControlProblem(Frozen):
         """The first difference from a problem of another :attr:`setting` in words; empty if there is none."""
         for name in dict.fromkeys((*self.setting, *setting)):
             theirs, mine = (np.asarray(one.get(name, np.zeros(0))) for one in (setting, self.setting))
-            texts = mine.dtype.kind == "U" or theirs.dtype.kind == "U"
+            texts = "U" in (mine.dtype.kind, theirs.dtype.kind)
             if not (np.array_equal(theirs, mine) if texts else same(theirs, mine)):
-                short = max(len(str(theirs)), len(str(mine))) <= _SHORT
-                return f"{name} = {theirs}, not {mine}" if short else f"different {name.replace('.', ' ')}"
+                single = mine.ndim == theirs.ndim == 0
+                return f"{name} = {theirs}, not {mine}" if single else f"different {name.replace('.', ' ')}"
         return ""
 
     def mismatch(self, setting: Mapping[str, Any], trajectory: Trajectory, cost: float) -> str:
@@ -499,49 +464,46 @@ class OptimalControlProblem(Frozen):
         u: Floats,
         gains: Floats,
         reference: Floats,
-        on: Literal["momentum", "velocity"],
+        on: Literal["momentum", "velocity"] | None,
         *,
-        before: JointValues | None,
-        previous_gains: Floats | None = None,
-        previous: Floats | None = None,
         substeps: int = 1,
+        **options: Any,
     ) -> LinearPolicy:
-        """A policy of the problem's decisions, in ``substeps`` parts of its steps."""
-        return LinearPolicy(
-            u,
-            gains,
-            reference,
-            hold=self.hold * substeps,
-            on=on,
-            limits=(self.control_limits[0], self.control_limits[1]),
-            previous_gains=previous_gains,
-            previous=previous,
-            before=before,
-            period=self.period,
-            joints=self.scene.control_joints,
-            servos=self.scene.servo_joints,
-            linear=self.linear,
-        )
+        """A policy of the problem's decisions, in ``substeps`` parts of its steps; ``options`` as for the policy."""
+        scene, limits = self.scene, (self.control_limits[0], self.control_limits[1])
+        options |= {"limits": limits, "period": self.period, "linear": self.linear, "hold": self.hold * substeps}
+        options |= {"joints": scene.control_joints, "servos": scene.servo_joints}
+        if scene.processes and self.integrator.variational == (on == "momentum"):
+            # Feedback and margins are for the noise as this method takes it.
+            options["integrator"] = self.integrator
+        return LinearPolicy(u, gains, reference, on=on, **options)
+
+    def feedback(self, omega: float) -> Floats:
+        """Gains (m, 2n) on x of the forces -M(q0) (omega^2 dq + 2 omega dv), as far as controls give them."""
+        scene, n = self.scene, self.q0.size
+        mass, along = lagrangian_jet(scene, self.q0, np.zeros(n)).Lvv, tangent_basis(scene, self.q0)
+        on_speeds = np.eye(n) if self.integrator.variational else mass
+        wanted = along.T @ np.hstack([omega**2 * mass, 2.0 * omega * on_speeds])
+        gains: Floats = -np.linalg.pinv(along.T @ scene.actuation) @ wanted
+        gains[scene.prescribed] = 0.0
+        return gains
 
     def _holding_feedback(self) -> Floats:
         """Gains (m, 2n) of :meth:`holding_policy`; zero where joints are not driven or controls are held too long."""
         scene, q = self.scene, self.q0
         jet, along = lagrangian_jet(scene, q, np.zeros(q.size)), tangent_basis(scene, q)
-        mass, curvature, driven = jet.Lvv, jet.Lqq, along.T @ scene.actuation
+        curvature, driven = jet.Lqq, along.T @ scene.actuation
         if scene.constraints:
             # Constraint forces change with q, too.
             (C,) = scene.core.constraints(q[None])[2]
             left = scene.actuation @ self.holding_controls() - scene.static_pull(q)
             y = np.linalg.lstsq(C.T, left, rcond=_SINGULAR)[0]
             curvature = curvature - scene.core.constraint_curvature(q, y, np.zeros(q.size))[0]
-        squares = np.linalg.eigvals(np.linalg.solve(along.T @ mass @ along, along.T @ curvature @ along))
+        squares = np.linalg.eigvals(np.linalg.solve(along.T @ jet.Lvv @ along, along.T @ curvature @ along))
         omega = 2.0 * float(np.sqrt(np.abs(squares).max(initial=0.0))) + 1.0 / self.duration
-        if np.linalg.matrix_rank(driven) < len(driven) or omega * self.period > _FASTEST:
+        if np.linalg.matrix_rank(driven) < len(driven) or omega * self.period > FASTEST:
             return np.zeros((scene.controls, 2 * q.size))
-        on_speeds = np.eye(q.size) if self.integrator.variational else mass
-        wanted = along.T @ np.hstack([omega**2 * mass, 2.0 * omega * on_speeds])
-        gains: Floats = -np.linalg.pinv(driven) @ wanted
-        return gains
+        return self.feedback(omega)
 
     def decided(self, trajectory: Trajectory) -> Floats:
         """The controls (R, m) of a motion on the problem's grid, one row per decision."""
@@ -570,14 +532,17 @@ class OptimalControlProblem(Frozen):
             return at_q, at_v, np.ascontiguousarray(between.reshape(*at_q.shape[:-1], u.shape[-1]))
         return at_q, at_v, u if len(self.rule) == 1 else np.repeat(u, len(self.rule), axis=-2)
 
+    def _end(self, q: Floats, v: Floats) -> tuple[Floats, Floats, Floats]:
+        """The last state of motions, and no control."""
+        return q[..., -1:, :], v[..., -1:, :], np.zeros((*q.shape[:-2], 1, self.scene.controls))
+
     def costs(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """The cost (...) of motions without noise terms: q and v (..., N + 1, n), u (..., N, m)."""
         values = self.running.value(*self.samples(q, v, u))
         # All samples of a rule have the same weight.
         running = values.sum(axis=-1) * (self.dt * self.rule[0, 0])
-        end = np.zeros((*u.shape[:-2], 1, u.shape[-1]))
-        total: Floats = running + self.terminal.value(q[..., -1:, :], v[..., -1:, :], end)[..., 0]
-        return total if self.rate is None else total + self.rate.value(u, self.period)
+        total: Floats = running + self.terminal.value(*self._end(q, v))[..., 0]
+        return total if self.rate is None else total + self.rate.value(u[..., :: self.hold, :], self.period)
 
     def cost_of(self, trajectory: Trajectory) -> float:
         """The cost of one motion on the problem's grid.
@@ -603,10 +568,9 @@ class OptimalControlProblem(Frozen):
         causes no rounding error.
         """
         q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
-        at, weight = self.samples(q, v, u), self.dt * self.rule[0, 0]
-        found = [weight * self.running.compiled(*at).ravel()]
-        found += [weight * (factor * part.value(*at)) for factor, part in self.running.others]
-        found += [values.ravel() for values in self.terminal.shares(q[-1:], v[-1:], np.zeros((1, u.shape[1])))]
+        weight = self.dt * self.rule[0, 0]
+        found = [weight * part.ravel() for part in self.running.shares(*self.samples(q, v, u))]
+        found += [part.ravel() for part in self.terminal.shares(*self._end(q, v))]
         if self.rate is not None:
             found.append(self.rate.shares(u[:: self.hold], self.period))
         return np.concatenate(found)
@@ -614,14 +578,11 @@ class OptimalControlProblem(Frozen):
     def not_finite(self, trajectory: Trajectory) -> tuple[Cost, ...]:
         """The cost terms that are not finite on a motion; those of the controls' rate are not tested."""
         q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
-        along, end = self.samples(q, v, u), (q[-1:], v[-1:], np.zeros((1, u.shape[1])))
         # The parts of both sums are in the order of the cost's terms.
-        found: list[Cost] = []
-        for at_end, (total, at) in enumerate(((self.running, along), (self.terminal, end))):
-            for term, (_, part) in zip(_placed(self.cost, at_end), total.parts, strict=True):
-                if not np.isfinite(part.value(*at)).all():
-                    found.append(term)
-        return tuple(found)
+        pairs = ((self.running, self.samples(q, v, u)), (self.terminal, self._end(q, v)))
+        values = [part.value(*at) for bound, at in pairs for _, part in bound.parts]
+        terms = [term for at_end in (0, 1) for term in _placed(self.cost, at_end)]
+        return tuple(term for term, own in zip(terms, values, strict=True) if not np.isfinite(own).all())
 
     def simulate(
         self,
@@ -658,7 +619,14 @@ class OptimalControlProblem(Frozen):
 
     def expand_terminal(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the terminal costs at the end of a motion, in (q, v, u)."""
-        return self.terminal.expand(trajectory.q[-1:], trajectory.v[-1:], np.zeros((1, self.scene.controls)))
+        return self.terminal.expand(*self._end(trajectory.q, trajectory.v))
+
+
+def require_problem(problem: object) -> OptimalControlProblem:
+    """``problem`` itself; an InputError if it is no OptimalControlProblem."""
+    if not isinstance(problem, OptimalControlProblem):
+        raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
+    return problem
 
 
 def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
@@ -669,7 +637,7 @@ def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
     steps of plans an impulse costs two to five times as much.
     """
     kick = usual_kick(scene)
-    if not scene.constraints and dt * rate_at_rest(scene, q0) > _STIFF:
+    if not scene.constraints and dt * rate_at_rest(scene, q0) > STIFF:
         return Radau(STAGES, kick=kick)
     if scene.constraints or scene.custom is not None:
         return Gauss(STAGES, kick=kick)
@@ -696,10 +664,9 @@ def _rule(sampling: str, dt: float, *, cubic: bool) -> tuple[Floats, Floats]:
     return places, np.column_stack([np.full(len(places), 1.0 / len(places)), cubics(places, dt)])
 
 
-def _times(places: Floats, steps: int, dt: float) -> Floats:
-    """Times of all samples since the beginning of the horizon (N s,) [s], at ``places`` in each step."""
-    times: Floats = ((np.arange(steps, dtype=np.float64)[:, None] + places) * dt).reshape(-1)
-    return times
+def _cubic(scene: Scene) -> bool:
+    """Whether a scene has cubic inputs, whose velocities at the nodes are controls."""
+    return max(scene.rates, default=-1) >= 0
 
 
 def bind_cost(

@@ -14,7 +14,7 @@ from varpin.control.history import Refined, Refinement, Status, part
 from varpin.control.multipliers import FEASIBLE, REPORTED
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
-from varpin.control.verification import excess, on_robot
+from varpin.control.verification import Verification, excess, verify
 from varpin.errors import VarpinError
 from varpin.trajectory import Trajectory
 
@@ -67,9 +67,10 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
             if solution.status is Status.INTERRUPTED:
                 best = best or _Best((9, 0.0), solution, 0, "")
                 raise KeyboardInterrupt
-            found = on_robot(
+            found = verify(
                 problem,
                 solution.trajectory,
+                solution.cost,
                 solution.policy_on,
                 tolerance=_KNOWN * wish,
                 above=solution.cost + _FAR * wish * abs(solution.cost),
@@ -79,19 +80,19 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
                 dt=problem.dt,
                 steps=problem.steps,
                 cost=solution.cost,
-                true_cost=found.closed.cost,
-                open_loop_cost=found.opened.cost,
-                loss=excess(found.closed.cost, solution.cost) if found.known else np.nan,
+                true_cost=found.closed_loop_cost,
+                open_loop_cost=found.open_loop_cost,
+                loss=found.closed_loop_loss if found.told else np.nan,
                 iterations=solution.iterations,
                 status=solution.status,
                 seconds=time.perf_counter() - began,
-                violation=found.violation,
+                violation=float(np.max([own.share for own in found.constraints], initial=0.0)),
             )
             tried.append(row)
             kind, value = _failing(row, solution, wish)
             rank = kind, value if kind else row.true_cost
             if best is None or rank < best.rank:
-                best = _Best(rank, solution, len(tried) - 1, found.beyond if kind >= 2 else "")
+                best = _Best(rank, solution, len(tried) - 1, _beyond(found) if kind >= 2 else "")
             finer, ended = None, _ended(tried, best.chosen, solution, time_left())
             doing = f"with half of dt = {problem.dt:g} s"
             half, fails = _halved(problem)
@@ -118,9 +119,17 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
             return _given_up(best._replace(solution=interrupted), wish, tried, interrupted.reason)
 
 
+def _beyond(found: Verification) -> str:
+    """The constraint that is violated most, by how much and where, in words; empty where all hold."""
+    worst = max(found.constraints, key=lambda own: own.share, default=None)
+    if worst is None or not worst.where:
+        return ""
+    return f"{worst.label} is violated by {worst.closed_loop:.2g} {worst.unit} ({worst.where})"
+
+
 def _motion_of(coarse: Solution, problem: OptimalControlProblem) -> Trajectory:
     """The motion of a plan in half its steps."""
-    return problem.simulate(coarse.policy_on("momentum" if problem.integrator.variational else "velocity", 2))
+    return problem.simulate(coarse.policy_on(substeps=2))
 
 
 def _halved(problem: OptimalControlProblem) -> tuple[OptimalControlProblem | None, str]:

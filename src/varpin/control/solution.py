@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -17,12 +17,13 @@ from varpin.control.history import Iteration, Refinement, SearchState, Status
 from varpin.control.monte_carlo import MonteCarlo, monte_carlo
 from varpin.control.multipliers import ConstraintReport, Multipliers, reports
 from varpin.control.noise import left_within_steps
-from varpin.control.problem import OptimalControlProblem
+from varpin.control.problem import OptimalControlProblem, require_problem
 from varpin.control.solution_file import read, write
 from varpin.control.stages import Feedback, Steps
 from varpin.control.verification import Verification, verify
 from varpin.errors import InputError
 from varpin.finding import Finding
+from varpin.io.archive import Axes
 from varpin.linearization import velocity_at_nodes
 from varpin.signals.policy import LinearPolicy
 from varpin.support.checks import JointValues, count, positive, word
@@ -35,20 +36,9 @@ from varpin.trajectory import Trajectory
 class Solution(Frozen):
     """The best motion a solver found, with the policy around it.
 
-    ``print(plan.table())`` shows a row for each iteration, then how the search ended and why:
-
-    ========== =====================================================================================
-    iter       Number of the iteration, from 0.
-    cost       Cost of the motion after the iteration, without noise.
-    noise cost Cost added by noise to the motion before the iteration, by the solver's model.
-    expected   Decrease of the expected cost by the quadratic model for a full step.
-    decrease   Actual decrease; near the expected one where the model is good.
-    grad       Largest entry of the expected cost's gradient in the controls.
-    reg        Regularization, relative to the diagonal of Quu; 0 where the model needs none.
-    step       Length of the accepted step, 0 where there is none, as at the end; above 1 where the cost
-               falls on beyond the model's minimum.
-    trials     Number of trials of the line search; * stands for second derivatives of the dynamics.
-    ========== =====================================================================================
+    ``print(plan.table())`` shows a row for each :class:`Iteration`, with a * where second derivatives of the dynamics
+    count, then how the search ended and why. A step of 0 is none, as at the end; one above 1 went beyond the model's
+    minimum.
 
     ``print(plan.verify())`` shows the plan's cost on the continuous system, ``print(plan.monte_carlo(200, rng=0))`` its
     cost under the scene's noise.
@@ -77,19 +67,19 @@ class Solution(Frozen):
         multipliers: Multipliers of the problem's constraints, with their margins; None without constraints.
     """
 
-    problem: OptimalControlProblem
-    trajectory: Trajectory
-    gains: Floats
-    feedforward: Floats
-    gradient: Floats
+    problem: OptimalControlProblem = field(metadata={"entry": None})
+    trajectory: Trajectory = field(metadata={"entry": None})
+    gains: Annotated[Floats, Axes("decisions", "controls", "states", finite=True)]
+    feedforward: Annotated[Floats, Axes("decisions", "controls", finite=True)]
+    gradient: Annotated[Floats, Axes("decisions", "controls")]
     cost: float
     noise_cost: float
     status: Status
     reason: str
     history: tuple[Iteration, ...]
     search: SearchState | None = None
-    previous_gains: Floats | None = None
-    warnings: tuple[Finding, ...] = ()
+    previous_gains: Annotated[Floats, Axes("decisions", "controls", "controls", finite=True)] | None = None
+    warnings: tuple[Finding, ...] = field(default=(), metadata={"entry": "plan.warnings"})
     refinement: Refinement | None = None
     multipliers: Multipliers | None = None
 
@@ -126,7 +116,7 @@ class Solution(Frozen):
     @property
     def policy(self) -> LinearPolicy:
         """Controls with feedback, on the x of the problem's integrator."""
-        return self.policy_on("momentum" if self.problem.integrator.variational else "velocity")
+        return self.policy_on()
 
     def __repr__(self) -> str:
         noise = f" + {self.noise_cost:.4g} by noise" if self.noise_cost else ""
@@ -171,7 +161,7 @@ class Solution(Frozen):
         Raises:
             FileError: The path cannot be written.
         """
-        return write(path, {item.name: getattr(self, item.name) for item in fields(self)})
+        return write(path, self)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], problem: OptimalControlProblem) -> Solution:
@@ -181,25 +171,26 @@ class Solution(Frozen):
             FileError: The file is missing, truncated, no npz, written by something else, holds pickled objects, arrays
                 that do not fit together or are not finite, or is of another problem.
         """
-        if not isinstance(problem, OptimalControlProblem):
-            raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
-        return cls(**read(path, problem))
+        return read(cls, path, require_problem(problem))
 
-    def shifted(self, decisions: int, before: JointValues | None = None) -> LinearPolicy:
+    def shifted(
+        self, decisions: int, before: JointValues | None = None, x: Literal["momentum", "velocity"] | None = None
+    ) -> LinearPolicy:
         """The policy from a later decision on, its last row repeated, to start the next horizon with.
 
         Where controls are linear between nodes, the last control is held with the feedback of the plan's middle about
         its last state: near the end of a plan the feedback of linear controls is no stable law.
 
         ``before`` is the control before that decision, (m,) or by joint name; by default the plan's own. Where controls
-        are linear between nodes, it is the control of that decision itself, with which the first line begins.
+        are linear between nodes, it is the control of that decision itself, with which the first line begins. ``x`` is
+        what the policy reacts to, by default that of the problem's integrator; see :meth:`policy_on`.
 
         Raises:
             InputError: ``decisions`` is not from 0 to R - 1, or a control has a wrong shape.
         """
         if not 0 <= count("decisions", decisions) < len(self.gains):
             raise InputError(f"decisions must be from 0 to {len(self.gains) - 1}, got {decisions}")
-        policy, motion, N = self.policy, self.trajectory, len(self.policy.u)
+        policy, motion, N = self.policy_on(x), self.trajectory, self.problem.decisions - self.problem.linear
         later = np.arange(N) + decisions
         rows = np.minimum(later, N - 1)
         u, reference, expected = policy.u[rows], policy.reference[rows], policy.u[:0]
@@ -214,12 +205,11 @@ class Solution(Frozen):
         previous_gains = None if policy.previous_gains is None else policy.previous_gains[rows]
         # A repeated control has itself as its previous one.
         previous = None if previous_gains is None else np.vstack([expected, u[:-1]])
-        on: Literal["momentum", "velocity"] = "velocity" if policy.on == "velocity" else "momentum"
-        given = u, policy.gains[rows], reference, on
+        given = u, policy.gains[rows], reference, policy.on
         return self.problem.policy_of(*given, before=before, previous_gains=previous_gains, previous=previous)
 
-    def policy_on(self, x: Literal["momentum", "velocity"], substeps: int = 1) -> LinearPolicy:
-        """The policy on (q, p) or on (q, v), each control held over ``substeps`` times as many steps.
+    def policy_on(self, x: Literal["momentum", "velocity"] | None = None, substeps: int = 1) -> LinearPolicy:
+        """The policy on (q, p) or on (q, v), by default the integrator's, over ``substeps`` times as many steps.
 
         A simulation needs no ``substeps``: it derives them from its dt and the policy's period.
 
@@ -228,6 +218,8 @@ class Solution(Frozen):
         Raises:
             InputError: ``x`` is neither "momentum" nor "velocity".
         """
+        own: Literal["momentum", "velocity"] = "momentum" if self.problem.integrator.variational else "velocity"
+        x = own if x is None else x
         word("x", x, ("momentum", "velocity"))
         gains, trajectory, hold = self.gains, self.trajectory, self.problem.hold
         rows, n = slice(0, -1, hold), self.problem.scene.robot.dof
@@ -236,7 +228,7 @@ class Solution(Frozen):
             # The first control is the value at the beginning of the first line.
             gains = gains[1:]
             previous_gains = None if previous_gains is None else previous_gains[1:]
-        if self.problem.integrator.variational != (x == "momentum"):
+        if x != own:
             rates = velocity_at_nodes(self.problem.scene, trajectory.q[rows], trajectory.v[rows])
             by_q, by_p = rates[:, :, :n], rates[:, :, n:]
             second = gains[:, :, n:]

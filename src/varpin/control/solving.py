@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,10 @@ from numpy.typing import ArrayLike
 
 from varpin.control.checks import foreseen, looked_at
 from varpin.control.history import ITERATIONS, Iteration, Status
-from varpin.control.problem import OptimalControlProblem
+from varpin.control.problem import OptimalControlProblem, require_problem
 from varpin.control.refine import SUFFICIENT, refine
 from varpin.control.rollout import controls_along, first_commands
-from varpin.control.search import Search
+from varpin.control.search import Report, Search
 from varpin.control.solution import Solution
 from varpin.control.starts import Path, commands_along, path_of
 from varpin.errors import InputError
@@ -49,11 +50,10 @@ def solve(
 ) -> Solution:
     """Solve an optimal control problem by S-DDP (Algorithm 2 of the paper).
 
-    Each iteration linearizes along the motion, runs a backward pass through the quadratic model of the cost to go,
-    noise terms included, and searches along the new controls for a motion of lower expected cost. The expected cost is
-    the cost of the motion plus what noise adds to it under the model. Where limits or constraints are in reach, the
-    changes of the controls are those of one quadratic program over the horizon, and the search lowers the expected cost
-    plus a penalty of the violations.
+    Each iteration linearizes along the motion, runs a backward pass through the quadratic model of the cost to go, and
+    searches along the new controls for a motion of lower expected cost: its cost plus what noise adds under the model.
+    Where limits or constraints are in reach, the changes of the controls are those of one quadratic program over the
+    horizon, and the search lowers the expected cost plus a penalty of the violations.
 
         robot = vp.load_robot("ur5")
         cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost([0.5, -1, 1, 0, 0.5, 0], 1e3) + vp.VelocityCost(10))
@@ -62,8 +62,7 @@ def solve(
         print(plan.table())
         print(plan.verify())
 
-    Ctrl-C ends the search once the first motion has been integrated, and returns the best motion so far with ``status``
-    INTERRUPTED. ``solve(problem, plan)`` continues from there.
+    Ctrl-C returns the best motion so far with ``status`` INTERRUPTED; ``solve(problem, plan)`` continues from there.
 
     Feedback is that of the costs and goals alone: limits and other constraints never enter it. The noise cost is that
     of linear feedback, without controls that noise drives into their limits; ``monte_carlo`` includes them.
@@ -73,10 +72,8 @@ def solve(
         controls: Initial controls: None to hold the robot at q0; an array (R, m) or (m,), R the number of
             decisions; by joint name; a :class:`LinearPolicy`; or a :class:`Solution`, whose policy then runs on this
             problem. Controls outside the problem's limits are clipped.
-        tolerance: Stop when the expected decrease is below this fraction of the cost at stake, (O9): the decrease of
-            the cost's own quadratic models along the motion if each state and control were free, and at most their
-            change over the motion's displacement. For squared distances it is about their value. Constants in the cost
-            and the noise cost do not count.
+        tolerance: Stop when the expected decrease is below this fraction of the cost at stake, (O9). For squared
+            distances that is about their value; constants in the cost and the noise cost do not count.
         max_iterations: Greatest number of iterations.
 
     Other Args:
@@ -84,34 +81,31 @@ def solve(
             model stays convex. Converges quadratically; needs an integrator that has them (:class:`Midpoint`).
         regularization: Initial value, relative to the diagonal of Quu; it increases and decreases as needed.
         time_limit: No iteration begins after this time since the call [s]. The result then depends on the machine.
-        callback: Called with each :class:`Iteration`; ``callback=print`` prints the rows of :meth:`Solution.table`. The
-            log has them at level INFO, preceded by the robot and the horizon. A function of two arguments is also given
-            the motion after the iteration, a :class:`varpin.Trajectory`.
+        callback: Called with each :class:`Iteration`, which the log has at level INFO; ``callback=print`` prints the
+            rows of :meth:`Solution.table`. A function of two arguments is also given the motion after the iteration, a
+            :class:`varpin.Trajectory`.
         progress: Called after each iteration with (iterations done, max_iterations); few searches need them all.
-        resume: A solution of the same problem, as solve returned it or as read from a file: the search continues where
-            it stopped, for at most ``max_iterations`` more, as if it had not been interrupted. Give the other options
-            as before; ``regularization`` is taken from the solution.
-        check: Check the finished plan: whether its cost in finer steps agrees, and whether its velocities alternate or
-            oscillate. ``Solution.warnings`` and the log have the result. It takes as long as a few motions of the
-            search.
+        resume: A solution of the same problem, also one read from a file: the search continues where it stopped, for at
+            most ``max_iterations`` more, as if it had not been interrupted. Give the other options as before;
+            ``regularization`` is taken from the solution.
+        check: Check the finished plan, in the time of a few motions, for ``Solution.warnings`` and the log.
         true_cost: Greatest difference between the plan's cost and its cost with feedback on the continuous system,
             relative to the former: 0.01 for a percent; and greatest excess of the latter over the optimum of finer
             controls, as estimated from the plan of half the step. Constraints must then hold on the continuous system
-            to a thousandth of their range. The problem's step is the coarsest; it is halved, each search starting from
-            the plan before, until all that is so.
-            ``Solution.problem`` has the plan's step. ``Solution.refinement`` lists the steps tried, or why the accuracy
-            cannot be reached; a warning reports that, too. Controls that are held over several steps keep their period,
-            and their optimum is that of the period. ``max_iterations`` is for each step, ``time_limit`` for all;
-            ``tolerance`` is at least a hundredth of ``true_cost``. Ctrl-C keeps the best plan so far. Where dampers are
-            far faster than the step, ``controls="linear"`` in the problem reaches the accuracy at much larger steps.
+            to a thousandth of their range. The problem's step is halved, each search starting from the plan before,
+            until all that is so. ``Solution.problem`` has the plan's step, ``Solution.refinement`` the steps tried, or
+            why the accuracy cannot be reached. Controls that are held over several steps keep their period.
+            ``max_iterations`` is for each step, ``time_limit`` for all; ``tolerance`` is at least a hundredth of
+            ``true_cost``. Where dampers are far faster than the step, ``controls="linear"`` in the problem reaches the
+            accuracy at much larger steps.
         states: Initial states, which need not be feasible: configurations at the nodes (N + 1, n), the first one q0; a
-            pair (q, v) of such arrays; or a :class:`varpin.Trajectory`. A straight line or the path of another planner
-            will do: the first motion is held on it by feedback, as far as controls can. ``controls`` are then those
-            along the states, by default the inverse dynamics' clipped to their limits.
+            pair (q, v) of such arrays; or a :class:`varpin.Trajectory`. The first motion is held on them by feedback,
+            as far as controls can. ``controls`` are then those along the states, by default the inverse dynamics'
+            clipped to their limits.
 
     Returns:
-        The best motion found, however the search ended. ``status`` and ``reason`` tell how it ended; ``warnings`` lists
-        what keeps a robot from following the plan.
+        The best motion found. ``status`` and ``reason`` tell how the search ended; ``warnings`` lists what keeps a
+        robot from following the plan.
 
     Raises:
         InputError: Controls of a wrong shape, or options out of their range.
@@ -120,8 +114,7 @@ def solve(
         StepFailure: The first motion cannot be integrated; the error holds the motion up to there.
         CostError: The cost of the first motion is not finite, or a custom cost fails there.
     """
-    if not isinstance(problem, OptimalControlProblem):
-        raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
+    require_problem(problem)
     if not real("regularization", regularization) >= 0.0:
         raise InputError(f"regularization must be >= 0, got {regularization}")
     second_order, check = flag("second_order", second_order), flag("check", check)
@@ -142,7 +135,7 @@ def solve(
         # The search may take long where values are in wrong units.
         announce(logger, problem.scene.announced, problem.dt, foreseen(problem))
 
-    def searched(
+    def plan_of(
         problem: OptimalControlProblem,
         controls: JointValues | LinearPolicy | Solution | None,
         resume: Solution | None = None,
@@ -165,26 +158,33 @@ def solve(
                 # A converged search reports once more after its last iteration.
                 progress(min(item.index + 1 - known, most), most)
 
-        try:
-            status = search.run(tolerance, most, deadline, report)
-        except KeyboardInterrupt:
-            status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
-        if status is Status.INFEASIBLE and not (controls is None and path is None):
-            search.reason += "; the default start, without controls= and states=, may have a plan"
-        return search.solution(status)
+        plan = searched(search, tolerance, most, deadline, report)
+        if plan.status is Status.INFEASIBLE and not (controls is None and path is None):
+            advice = "; the default start, without controls= and states=, may have a plan"
+            return replace(plan, reason=plan.reason + advice)
+        return plan
 
     with one_thread():
         if true_cost is None:
-            solution = searched(problem, controls, resume, path)
+            solution = plan_of(problem, controls, resume, path)
         else:
             wish = positive("true_cost", true_cost, "1")
 
             def once(finer: OptimalControlProblem, start: Trajectory | None) -> Solution:
                 given, on = (controls, path) if start is None else (finer.decided(start), (start.q, start.v))
-                return searched(finer, given, None, on, max(tolerance, SUFFICIENT * wish))
+                return plan_of(finer, given, None, on, max(tolerance, SUFFICIENT * wish))
 
             solution = refine(problem, once, wish, lambda: deadline - time.perf_counter())
     return looked_at(solution) if check else solution
+
+
+def searched(search: Search, tolerance: float, most: int, deadline: float, report: Report) -> Solution:
+    """What a search finds in at most so many iterations; Ctrl-C ends it with the best motion so far."""
+    try:
+        status = search.run(tolerance, most, deadline, report)
+    except KeyboardInterrupt:
+        status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
+    return search.solution(status)
 
 
 def _require_resumable(problem: OptimalControlProblem, resume: Solution) -> None:

@@ -9,12 +9,12 @@ import numpy as np
 
 from varpin import core
 from varpin.arrays import Floats
-from varpin.control.problem import OptimalControlProblem
+from varpin.control.multipliers import FEASIBLE
+from varpin.control.problem import FASTEST, OptimalControlProblem
 from varpin.control.rollout import around
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, VarpinError
 from varpin.linearization import node_jets
-from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.model import degrees_hint
 from varpin.signals.commands import as_moved, with_ends
 from varpin.simulation.record import rollout
@@ -22,11 +22,6 @@ from varpin.support.checks import finite_array
 from varpin.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
-
-# Greatest distance of the first state from the problem's [rad or m].
-_SAME = 1e-6
-# Natural frequency of the feedback that holds a motion on its states, times the decision period; from 0.1 to 0.5.
-_HOLDING_FREQUENCY = 0.25
 
 # States at a problem's nodes: q (N + 1, n) [rad or m] and v (N + 1, n) [rad/s or m/s].
 Path = tuple[Floats, Floats]
@@ -56,7 +51,7 @@ def path_of(problem: OptimalControlProblem, given: Any) -> Path:
     units = degrees_hint(robot, "states: the position", positions[int(np.abs(positions).max(axis=1).argmax())])
     off = np.abs(positions[0] - problem.q0)
     joint = int(off.argmax())
-    if off[joint] > _SAME:
+    if off[joint] > FEASIBLE:
         raise InputError(
             f"states must begin at the problem's q0: joint {names[joint]!r} is at {positions[0, joint]:.6g} in their "
             f"first row, and at {problem.q0[joint]:.6g} in q0{'; ' if units else ''}{units}"
@@ -81,14 +76,10 @@ def commands_along(problem: OptimalControlProblem, path: Path, controls: Floats 
     if u is None:
         u = as_moved(scene, q[hold::hold], v[hold::hold], _joint_forces(problem, q, v) @ scene.allocation.T)
         u = np.clip(u, *problem.control_limits)
-    M = lagrangian_jet(scene, problem.q0, np.zeros(scene.robot.dof)).Lvv
-    omega, on_speed = _HOLDING_FREQUENCY / problem.period, M
     q, v = q[:-1:hold], v[:-1:hold]
     if problem.integrator.variational:
-        v, on_speed = (node_jets(scene, q, v)[0] @ v[:, :, None])[:, :, 0], np.eye(len(M))
-    gains = scene.allocation @ -np.hstack([omega**2 * M, 2.0 * omega * on_speed])
-    gains[scene.prescribed] = 0.0
-    x = np.hstack([q, v])
+        v = (node_jets(scene, q, v)[0] @ v[:, :, None])[:, :, 0]
+    x, gains = np.hstack([q, v]), problem.feedback(FASTEST / problem.period)
     if not problem.linear:
         return around(problem, u, x, np.tile(gains, (len(u), 1, 1)), None)
     if controls is None:

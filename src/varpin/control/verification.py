@@ -11,10 +11,9 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
-from varpin.control.problem import OptimalControlProblem
+from varpin.control.problem import STIFF, OptimalControlProblem
 from varpin.core.arrays import Commands
 from varpin.integrators import Gauss, Integrator, Radau, RungeKutta4
-from varpin.mechanics.scene import quiet
 from varpin.signals.commands import open_line, open_loop
 from varpin.signals.policy import LinearPolicy
 from varpin.simulation.record import rollout
@@ -27,16 +26,33 @@ logger = logging.getLogger(__name__)
 # A plan's policy on (q, p) or (q, v), in parts of its steps.
 Policy: TypeAlias = Callable[[Literal["momentum", "velocity"], int], LinearPolicy]
 
-# Relative accuracy of the costs above which nothing can be concluded about the plan.
-_UNKNOWN = 0.01
+# Relative difference of costs from which on it counts: above it nothing can be concluded from an inaccurate one.
+CLEAR = 0.01
 # Integrators of the continuous system: without and with fast damping, and with constraints of the scene.
 _USUAL, _FAST, _CLOSED = RungeKutta4(), Radau(3), Gauss(stages=3)
-# Damping is fast if its rate times the plan's step is greater. Up to twice that, both integrators take as long.
-_FASTER = 8.0
 _READING = (
-    "where feedback loses less than a percent, the plan holds; where it loses more, dt is too coarse (controls alone "
-    "also lose much where a motion is unstable)"
+    "how to read it: where feedback loses less than a percent, the plan holds; where it loses more, dt is too coarse "
+    "(controls alone also lose much where a motion is unstable)"
 )
+
+
+class Played(NamedTuple):
+    """A motion under commands in parts of a plan's steps; all NaN where it diverges."""
+
+    cost: float
+    outside: list[Outside]  # by each constraint
+    nodes: Floats  # configurations at the plan's nodes
+
+
+class Outside(NamedTuple):
+    """The worst violation of a constraint by a motion, in the constraint's unit."""
+
+    worst: float = np.nan
+    time: float = np.nan
+    row: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.row} at t = {self.time:.4g} s" if self.worst > 0.0 else ""
 
 
 @dataclass(frozen=True)
@@ -51,6 +67,7 @@ class ViolationOnRobot:
             NaN where the motion diverges.
         closed_loop: The same with feedback.
         where: The worst row and time with feedback, in words; empty without violation or where the motion diverges.
+        range: The range of the constraint's values, in the same unit; 1 m or 3 rad for frames and clearance.
     """
 
     label: str
@@ -59,6 +76,12 @@ class ViolationOnRobot:
     open_loop: float
     closed_loop: float
     where: str
+    range: float = 1.0
+
+    @property
+    def share(self) -> float:
+        """The violation with feedback, relative to the range."""
+        return self.closed_loop / self.range
 
     def __str__(self) -> str:
         ways = [("planned", self.planned), ("controls alone", self.open_loop), ("with feedback", self.closed_loop)]
@@ -78,7 +101,6 @@ class Verification:
         closed_loop_cost: Cost with feedback at the plan's own rate.
         open_loop_gap: Largest distance of the end from the plan's, in q, under the controls alone [rad or m].
         closed_loop_gap: The same with feedback.
-        defect: Largest distance in q of an accurately integrated step from the plan's [rad or m].
         substeps: Substeps of the accurate integration in one step of the plan.
         accuracy: Relative change over the last doubling of the substeps, of the cost that changed more. Infinite where
             no cost could be compared: all motions diverge, or they diverged with fewer substeps, or ``max_substeps``
@@ -87,6 +109,7 @@ class Verification:
             the plan's step.
         constraints: Violations of the problem's constraints on the continuous system, without margins, at the nodes of
             the accurate integration from the plan's first one on. Rate limits of controls apply to decisions.
+        decided: Whether the substeps ended because the cost with feedback is surely greater than was asked for.
     """
 
     planned_cost: float
@@ -94,11 +117,11 @@ class Verification:
     closed_loop_cost: float
     open_loop_gap: float
     closed_loop_gap: float
-    defect: float
     substeps: int
     accuracy: float
     integrator: str = str(_USUAL)
     constraints: tuple[ViolationOnRobot, ...] = ()
+    decided: bool = False
 
     @property
     def violation(self) -> float:
@@ -111,7 +134,7 @@ class Verification:
     @property
     def told(self) -> bool:
         """Whether the costs are known to a percent; if not, nothing can be concluded about the plan."""
-        return self.accuracy <= _UNKNOWN or self._diverges
+        return self.accuracy <= CLEAR or self.decided or self._diverges
 
     @property
     def open_loop_loss(self) -> float:
@@ -125,25 +148,22 @@ class Verification:
 
     @property
     def _diverges(self) -> bool:
-        """Whether the motion diverges under the controls alone and with feedback."""
         return not np.isfinite([self.open_loop_cost, self.closed_loop_cost]).any()
 
     @property
     def _reading(self) -> str:
         """How to read the costs, or why they say nothing."""
         if self.told:
-            return f"how to read it: {_READING}"
-        how = "were compared with no others"
-        if np.isfinite(self.accuracy):
-            how = f"still change by {percent(self.accuracy)}, as something is too fast"
+            return _READING
+        changed = f", and still change by {percent(self.accuracy)}" if np.isfinite(self.accuracy) else ""
         return (
             f"these costs say nothing of the plan: those of {self.substeps} steps of {self.integrator} in one of the "
-            f"plan's {how}: give max_substeps of {2 * self.substeps} or more"
+            f"plan's are not known to a percent{changed}: give max_substeps of {2 * self.substeps} or more"
         )
 
     def _rows(self) -> list[tuple[str, str, str, str]]:
-        """The costs, losses and gaps of the plan and of both motions, by their names."""
-        rows = [("planned", f"{self.planned_cost:.6e}", "", "")]
+        """The costs, losses and gaps of the plan and of both motions, below their names."""
+        rows = [("", "cost", "loss", "end off by [rad or m]"), ("planned", f"{self.planned_cost:.6e}", "", "")]
         opened = ("controls alone", self.open_loop_cost, self.open_loop_loss, self.open_loop_gap)
         closed = ("with feedback", self.closed_loop_cost, self.closed_loop_loss, self.closed_loop_gap)
         for name, cost, loss, gap in (opened, closed):
@@ -153,22 +173,19 @@ class Verification:
 
     def _notes(self) -> list[str]:
         """What is below the table."""
-        good = "how good the costs are is not known"
+        good = "all motions run away" if self._diverges else "how good the costs are is not known"
         if np.isfinite(self.accuracy):
             good = f"costs are good to {self.accuracy:.0e} of themselves"
-        elif self._diverges:
-            good = "all motions run away"
-        off = f"a step is off by {self.defect:.2e} rad or m at most; {good} ({self.substeps} substeps a step, "
-        return [f"{off}{self.integrator})", self._reading, *map(str, self.constraints)]
+        how = f"{good} ({self.substeps} substeps a step, {self.integrator})"
+        return [how, self._reading, *map(str, self.constraints)]
 
     def _repr_html_(self) -> str:
-        head = ("", "cost", "loss", "end off by [rad or m]")
+        head, *rows = self._rows()
         notes = [("", note) for note in self._notes()]
-        return facts("Verification on the continuous system", notes, table(head, self._rows()))
+        return facts("Verification on the continuous system", notes, table(head, rows))
 
     def __str__(self) -> str:
-        rows = [("", "cost", "loss", "end off by [rad or m]"), *self._rows()]
-        lines = (f"{name:16}{cost:>14}{loss:>12}  {gap}".rstrip() for name, cost, loss, gap in rows)
+        lines = (f"{name:16}{cost:>14}{loss:>12}  {gap}".rstrip() for name, cost, loss, gap in self._rows())
         return "\n".join([*lines, *self._notes()])
 
 
@@ -193,62 +210,77 @@ def verify(
     policy: Policy,
     *,
     tolerance: float,
-    max_substeps: int,
-    progress: Callable[[int, int], None] | None,
+    max_substeps: int = 1024,
+    progress: Callable[[int, int], None] | None = None,
+    above: float = np.inf,
+    substeps: int = 2,
 ) -> Verification:
-    """Compare a plan, and its policy on (q, p) or (q, v), with accurate integrations: see :func:`on_robot`."""
-    found = on_robot(problem, plan, policy, tolerance=tolerance, max_substeps=max_substeps, progress=progress)
-    both = zip(_outside(problem, problem, plan), found.opened.outside, found.closed.outside, strict=True)
-    verified = Verification(
-        planned_cost=planned_cost,
-        open_loop_cost=found.opened.cost,
-        closed_loop_cost=found.closed.cost,
-        open_loop_gap=float(np.abs(found.opened.nodes[-1] - plan.q[-1]).max()),
-        closed_loop_gap=float(np.abs(found.closed.nodes[-1] - plan.q[-1]).max()),
-        defect=_defect(problem, plan, found.substeps, found.integrator),
-        substeps=found.substeps,
-        accuracy=found.accuracy,
-        integrator=str(found.integrator),
-        constraints=tuple(
-            ViolationOnRobot(
-                problem.label_of(own.bound.source), own.bound.unit, own.worst, alone.worst, fed.worst, fed.where
-            )
-            for own, alone, fed in both
-        ),
-    )
-    if not verified.told:
-        logger.warning("%s", verified._reading)
-    return verified
+    """Compare a plan, and its policy on (q, p) or (q, v), with accurate integrations.
 
-
-class Outside(NamedTuple):
-    """The worst violation of a constraint by a motion."""
-
-    bound: BoundConstraint
-    worst: float = np.nan  # in the constraint's unit; NaN where the motion diverges
-    time: float = np.nan
-    row: str = ""
-
-    @property
-    def share(self) -> float:
-        """The violation relative to the constraint's range."""
-        return self.worst / (10.0 * self.bound.scale)
-
-    @property
-    def where(self) -> str:
-        """The row and the time in words; empty without violation."""
-        return f"{self.row} at t = {self.time:.4g} s" if self.worst > 0.0 else ""
-
-
-class Played(NamedTuple):
-    """A motion under commands in parts of a plan's steps: its cost, violations and configurations at the plan's nodes.
-
-    All are NaN where it diverges.
+    The parts of steps, ``substeps`` at first, double until the relative change of both costs is at most ``tolerance``,
+    or the cost with feedback is surely greater than ``above``. Where the explicit method does not reach that because of
+    fast dampers or dry friction, the L-stable one repeats the comparison.
     """
+    stiff = problem.dt * rate_at_rest(problem.scene, problem.q0) > STIFF
+    members = (_FAST,) if stiff else (_USUAL, _FAST)
+    for integrator in (_CLOSED,) if problem.scene.constraints else members:
+        parts, before = substeps, (np.nan, np.nan)
+        while True:
+            if progress is not None:
+                progress(parts, max_substeps)
+            opened, closed = replays(problem, problem.decided(plan), policy, integrator, parts)
+            changes = [
+                abs(now.cost - then) / max(abs(now.cost), np.finfo(float).tiny)
+                for now, then in zip((opened, closed), before, strict=True)
+                if np.isfinite(now.cost) and np.isfinite(then)
+            ]
+            decided = bool(closed.cost - above > abs(closed.cost - before[1]))
+            before, accuracy = (opened.cost, closed.cost), max(changes, default=np.inf)
+            if decided or accuracy <= tolerance or 2 * parts > max_substeps:
+                break
+            parts *= 2
+        found = Verification(
+            planned_cost=planned_cost,
+            open_loop_cost=opened.cost,
+            closed_loop_cost=closed.cost,
+            open_loop_gap=float(np.abs(opened.nodes[-1] - plan.q[-1]).max()),
+            closed_loop_gap=float(np.abs(closed.nodes[-1] - plan.q[-1]).max()),
+            substeps=parts,
+            accuracy=accuracy,
+            integrator=str(integrator),
+            constraints=_violations(problem, plan, opened, closed),
+            decided=decided,
+        )
+        if found.told or not problem.scene.dissipates:
+            break
+    if not found.told and above == np.inf:
+        logger.warning("%s", found._reading)
+    return found
 
-    cost: float
-    outside: list[Outside]
-    nodes: Floats
+
+def _violations(
+    problem: OptimalControlProblem, plan: Trajectory, opened: Played, closed: Played
+) -> tuple[ViolationOnRobot, ...]:
+    both = zip(_outside(problem, problem, plan), opened.outside, closed.outside, strict=True)
+    return tuple(
+        ViolationOnRobot(
+            problem.label_of(bound.source), bound.unit, own.worst, alone.worst, fed.worst, str(fed), 10.0 * bound.scale
+        )
+        for bound, (own, alone, fed) in zip(problem.bound_constraints, both, strict=True)
+    )
+
+
+def replays(
+    problem: OptimalControlProblem, controls: Floats, policy: Policy, integrator: Integrator, parts: int
+) -> tuple[Played, Played]:
+    """A plan in parts of its steps, without noise: under its controls alone, and with feedback at its own rate.
+
+    Raises:
+        VarpinError: A custom cost or noise field fails off the plan.
+    """
+    fine = problem.in_parts(parts)
+    opened, closed = in_parts(problem, controls, policy, integrator, parts)
+    return played(problem, fine, opened, integrator), played(problem, fine, closed, integrator)
 
 
 def played(
@@ -257,8 +289,7 @@ def played(
     """The motion of a problem under commands on ``fine``, the same :meth:`in_parts`."""
     motion, failure = rollout(fine.scene, integrator, fine.q0, fine.v0, commands, fine.dt)
     if failure is not None:
-        lost = np.full((1, fine.q0.size), np.nan)
-        return Played(np.nan, [Outside(bound) for bound in fine.bound_constraints], lost)
+        return Played(np.nan, [Outside() for _ in fine.bound_constraints], np.full((1, fine.q0.size), np.nan))
     cost = float(fine.costs(motion.q, motion.v, fine.control_rows(motion)))
     return Played(cost, _outside(problem, fine, motion), motion.q[:: fine.steps // problem.steps])
 
@@ -274,7 +305,7 @@ def _outside(problem: OptimalControlProblem, fine: OptimalControlProblem, motion
             # A row that is violated at the start cannot hold before the first node.
             excess[: fine.steps // problem.steps - 1, outside > 0.0] = 0.0
         sample, row = np.unravel_index(int(np.argmax(excess)), excess.shape)
-        found.append(Outside(bound, float(excess[sample, row]), float(bound.times[sample]), bound.rows[row]))
+        found.append(Outside(float(excess[sample, row]), float(bound.times[sample]), bound.rows[row]))
     return found
 
 
@@ -287,87 +318,6 @@ def at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats |
     return c
 
 
-class OnRobot(NamedTuple):
-    """A plan on the continuous system, and how it was found.
-
-    Attributes:
-        opened: Under its controls alone.
-        closed: With feedback.
-        substeps: Parts of the plan's steps.
-        accuracy: Relative change of the cost that changed more by the last doubling of the parts.
-        decided: Whether the cost with feedback is surely greater than a bound.
-        integrator: The accurate integrator.
-    """
-
-    opened: Played
-    closed: Played
-    substeps: int
-    accuracy: float
-    decided: bool
-    integrator: Integrator
-
-    @property
-    def known(self) -> bool:
-        """Whether the costs are good enough, greater than a bound, or infinite."""
-        return self.accuracy <= _UNKNOWN or self.decided or not np.isfinite([self.opened.cost, self.closed.cost]).any()
-
-    @property
-    def violation(self) -> float:
-        """Largest violation with feedback, relative to the constraint's range; NaN where the motion diverges."""
-        return float(np.max([own.share for own in self.closed.outside], initial=0.0))
-
-    @property
-    def beyond(self) -> str:
-        """The constraint that is violated most, by how much and where, in words; empty where all hold."""
-        worst = max(self.closed.outside, key=lambda own: own.share, default=None)
-        if worst is None or not worst.where:
-            return ""
-        return f"{worst.bound.source.label} is violated by {worst.worst:.2g} {worst.bound.unit} ({worst.where})"
-
-
-def on_robot(
-    problem: OptimalControlProblem,
-    plan: Trajectory,
-    policy: Policy,
-    *,
-    tolerance: float,
-    max_substeps: int = 1024,
-    progress: Callable[[int, int], None] | None = None,
-    above: float = np.inf,
-    substeps: int = 2,
-) -> OnRobot:
-    """A plan on the continuous system.
-
-    The parts of steps, ``substeps`` at first, double until the relative change of both costs is at most ``tolerance``,
-    or the cost with feedback is surely greater than ``above``. Where the explicit method does not reach that because of
-    fast dampers or dry friction, the L-stable one repeats the comparison.
-    """
-    fastest = problem.dt * rate_at_rest(problem.scene, problem.q0)
-    members = (_FAST,) if fastest > _FASTER else (_USUAL, _FAST)
-    for integrator in (_CLOSED,) if problem.scene.constraints else members:
-        parts, before = substeps, (np.nan, np.nan)
-        while True:
-            if progress is not None:
-                progress(parts, max_substeps)
-            fine = problem.in_parts(parts)
-            commands = in_parts(problem, problem.decided(plan), policy, integrator, parts)
-            opened, closed = (played(problem, fine, each, integrator) for each in commands)
-            changes = [
-                abs(now.cost - then) / max(abs(now.cost), np.finfo(float).tiny)
-                for now, then in zip((opened, closed), before, strict=True)
-                if np.isfinite(now.cost) and np.isfinite(then)
-            ]
-            decided = bool(closed.cost - above > abs(closed.cost - before[1]))
-            before, accuracy = (opened.cost, closed.cost), max(changes, default=np.inf)
-            if decided or accuracy <= tolerance or 2 * parts > max_substeps:
-                break
-            parts *= 2
-        found = OnRobot(opened, closed, parts, accuracy, decided, integrator)
-        if found.known or not problem.scene.dissipates:
-            break
-    return found
-
-
 def in_parts(
     problem: OptimalControlProblem, controls: Floats, policy: Policy, integrator: Integrator, parts: int
 ) -> tuple[Commands, Commands]:
@@ -378,15 +328,3 @@ def in_parts(
     fed = policy("momentum" if variational else "velocity", parts)
     closed = fed.commands(problem.steps * parts, m, n, variational=variational, stage_times=times)
     return alone._replace(hold=problem.hold * parts), closed
-
-
-def _defect(problem: OptimalControlProblem, plan: Trajectory, substeps: int, integrator: Integrator) -> float:
-    """Largest distance in q between the plan's steps and accurate ones from the same nodes; NaN where one diverges."""
-    u = plan.u_nodes[1:] if problem.linear else plan.u
-    commands = open_loop(u)._replace(hold=substeps, own=1)
-    if problem.linear:
-        times = np.array(integrator.stage_times or (0.5,))
-        commands = commands._replace(before=plan.u_nodes[:-1].copy(), stage_times=times)
-    begins = plan.q[:-1].copy(), plan.v[:-1].copy()
-    found = integrator.motions(quiet(problem.scene), *begins, commands, problem.dt / substeps)
-    return np.nan if found is None else float(np.abs(found[0][:, -1] - plan.q[1:]).max(initial=0.0))

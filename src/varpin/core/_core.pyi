@@ -32,8 +32,6 @@ class Mechanism:
         ratio: Floats,
         offset: Floats,
         origin: Integers,
-        loads: Integers,
-        carried: Integers,
         periodic: Integers,
         armature: Floats,
         group: Integers,

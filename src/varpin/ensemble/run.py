@@ -77,8 +77,9 @@ def simulate_ensemble(
             :class:`LinearPolicy`, evaluated at the state of each path.
 
     Other Args:
-        integrator: If left out, ``Midpoint(kick="held")``. In a scene without noise, the integrator that
-            :func:`varpin.simulate` takes for a few of the paths. ``Ensemble.integrator`` says which.
+        integrator: If left out, that of the policy of a plan under noise; else ``Midpoint(kick="held")``. In a scene
+            without noise, the integrator that :func:`varpin.simulate` takes for a few of the paths.
+            ``Ensemble.integrator`` says which.
         store: Keep every path. Otherwise only the statistics are kept, and memory does not grow with P N.
         quantiles: Levels in [0, 1]; with an empty list, workers return moments alone. Quantiles are of all paths if
             these are stored, or if P (N + 1) 2n is at most 33 million; otherwise of as many of the first paths,
@@ -118,6 +119,8 @@ def simulate_ensemble(
             raise InputError(f"controls are needed: {positions}")
         controls = scene.command_at(start[0][0])
     start, moved = _onto_constraints(scene, start)
+    if integrator is None and isinstance(controls, LinearPolicy):
+        integrator = controls.integrator
     if integrator is None:
         noisy = scene.processes > 0
         some = np.linspace(0, paths - 1, 1 if noisy else min(1 + paths // _OF, _CHOOSING)).astype(np.int64)

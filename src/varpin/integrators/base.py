@@ -140,6 +140,10 @@ class Integrator(ABC):
         """
         return 1.0 - 2.0 * self.left * (1.0 - self.left)
 
+    def damped(self, z: Floats) -> tuple[Floats, Floats]:
+        """What a step leaves of velocities whose damping has rates z (k,) in units of 1 / dt, and of noise impulses."""
+        return np.exp(-z), np.exp(-z)
+
     @abstractmethod
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[Any, list[Segment]]:
         """The state of a rollout of P paths at (q0, v0), each (P, n), and a segment of the first node of each.

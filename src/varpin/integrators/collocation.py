@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Literal
 
@@ -36,10 +35,6 @@ class Collocation(Variational):
             raise InputError(f"stages must be at most {MOST_STAGES}, got {self.stages}")
         super().__post_init__()
 
-    @abstractmethod
-    def _coefficients(self) -> tuple[Floats, Floats, Floats]:
-        """A (s, s), b (s,) and c (s,) of the method over a unit step."""
-
     @property
     def stage_times(self) -> tuple[float, ...]:
         return tuple(self._times().tolist()) if self.stages > 1 else ()
@@ -52,15 +47,10 @@ class Collocation(Variational):
 
         Without it they decay as exp(-Z s) over the step, for Z (n, n).
         """
-        _, inner = self._held(Z)
-        found: Floats = np.eye(len(Z)) - Z @ np.tensordot(self._coefficients()[1], inner, axes=1)
+        (a, b, c), n = self._coefficients(), len(Z)
+        stages = np.linalg.solve(np.eye(len(c) * n) + np.kron(a, Z), np.kron(c[:, None], np.eye(n)))
+        found: Floats = np.eye(n) - Z @ np.tensordot(b, stages.reshape(-1, n, n), axes=1)
         return found
-
-    def _held(self, Z: Floats) -> tuple[Floats, Floats]:
-        """The matrix (s n, s n) of the stages' momenta, and these (s, n, n) for an impulse of one."""
-        (a, _, c), n = self._coefficients(), len(Z)
-        matrix = np.eye(len(c) * n) + np.kron(a, Z)
-        return matrix, np.linalg.solve(matrix, np.kron(c[:, None], np.eye(n))).reshape(-1, n, n)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+import scipy
 
 from varpin import core
 from varpin.arrays import Floats
@@ -52,6 +53,11 @@ class _Explicit(Compiled):
 
     def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
         return Run(core.ExplicitRollout.start(scene.core, self.method, q0, v0), q0.copy())
+
+    def damped(self, z: Floats) -> tuple[Floats, Floats]:
+        """See :meth:`Integrator.damped`."""
+        kept = np.polynomial.polynomial.polyval(-z, 1.0 / scipy.special.factorial(np.arange(self.order + 1)))
+        return kept, kept
 
     def fork(self, state: Run) -> Run:
         return replace(state, paths=state.paths.copy())
@@ -122,6 +128,10 @@ class ExplicitEuler(_Explicit):
 
     method: ClassVar[ExplicitMethod] = ExplicitMethod.euler
     order = 1
+
+    def damped(self, z: Floats) -> tuple[Floats, Floats]:
+        # Noise adds to the velocity after the step.
+        return 1.0 - z, np.ones_like(z)
 
     def _jump(self, in_v: Floats) -> Floats:
         # Noise adds to the velocity after the step.

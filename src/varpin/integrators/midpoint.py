@@ -13,7 +13,7 @@ import scipy
 
 from varpin.arrays import Floats
 from varpin.core import Tableau
-from varpin.integrators.tableau import lobatto_places, midpoint
+from varpin.integrators.tableau import gauss_coefficients, lobatto_places, midpoint
 from varpin.integrators.variational import Guard, Variational
 from varpin.support.checks import fraction
 
@@ -77,6 +77,9 @@ class Midpoint(Variational):
 
     def _constraint_places(self) -> Floats | None:
         return lobatto_places(1) if self.alpha == 0.5 else None
+
+    def _coefficients(self) -> tuple[Floats, Floats, Floats]:
+        return gauss_coefficients(1)
 
     def _times(self) -> Floats:
         return np.array([float(self.alpha)])

@@ -36,8 +36,10 @@ from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.signals.commands import cubics
 from varpin.support.checks import count, fraction, is_one_of, positive
 from varpin.support.differences import FOURTH, slopes
-from varpin.trajectory import MOST_HALVINGS, Trajectory
+from varpin.trajectory import Trajectory
 
+# Largest number of halvings of a step.
+_MOST_HALVINGS = 30
 # Tolerance of an energy balance that is not checked.
 _UNCHECKED = 1e300
 
@@ -85,8 +87,8 @@ class Guard:
             raise InputError("branch_margin must be in [0, 1), got 1")
         positive("energy_balance", self.energy_balance, "1")
         positive("energy_budget", self.energy_budget, "1")
-        if count("max_halvings", self.max_halvings) > MOST_HALVINGS:
-            raise InputError(f"max_halvings must be at most {MOST_HALVINGS}, got {self.max_halvings}")
+        if count("max_halvings", self.max_halvings) > _MOST_HALVINGS:
+            raise InputError(f"max_halvings must be at most {_MOST_HALVINGS}, got {self.max_halvings}")
 
     def __repr__(self) -> str:
         text = written(self)
@@ -123,9 +125,20 @@ class Variational(Compiled):
     def holds_noise(self) -> bool:
         return self.kick == "held"
 
+    def damped(self, z: Floats) -> tuple[Floats, Floats]:
+        """See :meth:`Integrator.damped`."""
+        a, b, c = self._coefficients()
+        stages = np.linalg.solve(np.eye(len(c)) + z[:, None, None] * a, np.stack([np.ones_like(c), c], axis=1))
+        kept, held = (1.0 - z[:, None] * (b @ stages)).T
+        return kept, held if self.holds_noise else self.left * kept + (1.0 - self.left)
+
     @property
     def keeps_constraints(self) -> bool:
         return self._constraint_places() is not None
+
+    @abstractmethod
+    def _coefficients(self) -> tuple[Floats, Floats, Floats]:
+        """A (s, s), b (s,) and c (s,) over a unit step, by which forces act."""
 
     @abstractmethod
     def _tableau(self) -> Tableau:
@@ -313,12 +326,6 @@ class Variational(Compiled):
     def _steps(self, scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
         """Arguments of the core, by name, to repeat every step at dw = 0."""
         statistics = trajectory.statistics
-        if statistics.halvings.size or not (statistics.substeps == 1).all():
-            damage = statistics.damage()
-            if damage is None and (statistics.substeps < 1).any():
-                damage = "statistics.substeps holds numbers of parts that no step has"
-            if damage is not None:
-                raise InputError(f"the trajectory is damaged: {damage}")
         drift = self.drift_share * drifts(scene, trajectory)
         force = forces(scene, trajectory, drift)
         arrays = {

@@ -18,6 +18,7 @@ import typing
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
+from enum import Enum
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, BinaryIO, TypeVar
@@ -130,22 +131,36 @@ def members_of(record: Any, prefix: str = "") -> dict[str, Any]:
             members |= {f"{name}.{key}": array for key, array in value.items()}
         elif isinstance(value, tuple) and is_dataclass(kind := typing.get_args(hint)[0]):
             members |= {
-                f"{name}.{own.name}": np.array([getattr(each, own.name) for each in value]) for own in fields(kind)
+                f"{name}.{own.name}": np.array([_plain(getattr(each, own.name)) for each in value])
+                for own in fields(kind)
             }
         elif isinstance(value, tuple):
-            texts = [own.entry() if isinstance(own, Finding) else own for own in value]
-            members[name] = np.array(texts, dtype=np.str_)
+            members[name] = np.array([_plain(own) for own in value], dtype=np.str_)
         elif value is not None:
-            members[name] = value
+            members[name] = _plain(value)
     return members
 
 
-def record_of(kind: type[T], members: Mapping[str, Entry], source: Path, sizes: Mapping[str, int] | None = None) -> T:
-    """A record built from the entries of an npz file; ``sizes`` are known axes.
+def _plain(value: Any) -> Any:
+    """A value as files have it: a finding with its numbers as one text, and a member of an enumeration by its name."""
+    if isinstance(value, Finding):
+        return value.entry()
+    return value.name if isinstance(value, Enum) else value
 
-    Raises a FileError that names the file, the entry, and what is expected.
+
+def record_of(
+    kind: type[T],
+    members: Mapping[str, Entry],
+    source: Path,
+    sizes: Mapping[str, int] | None = None,
+    known: Mapping[str, Any] | None = None,
+) -> T:
+    """A record built from the entries of an npz file.
+
+    ``sizes`` are known axes, ``known`` the values of fields without an entry. Raises a FileError that names the file,
+    the entry, and what is expected.
     """
-    record: T = _Reader(source, members, dict(sizes or {})).record(kind, "")
+    record: T = _Reader(source, members, dict(sizes or {})).record(kind, "", known)
     return record
 
 
@@ -160,8 +175,8 @@ class _Reader:
     def error(self, name: str, found: object, expected: str) -> FileError:
         return FileError(f"{self.source}: {name} is {found} instead of {expected}")
 
-    def record(self, kind: Any, prefix: str) -> Any:
-        given = {}
+    def record(self, kind: Any, prefix: str, known: Mapping[str, Any] | None = None) -> Any:
+        given = dict(known or {})
         for item, name, hint in _entries(kind, prefix):
             below = any(member.startswith(f"{name}.") for member in self.members)
             if below or name in self.members or typing.get_origin(hint) is Mapping:
@@ -229,6 +244,8 @@ class _Reader:
     def scalar(self, kind: Any, value: Any, name: str) -> Any:
         if issubclass(kind, Finding) and isinstance(value, str):
             return kind.of_entry(value)
+        if issubclass(kind, Enum) and value in kind.__members__:
+            return kind[value]
         if kind is float and type(value) is int and abs(value) < 2**53:
             return float(value)
         if type(value) is not kind:
@@ -242,8 +259,13 @@ def _hints(kind: Any) -> dict[str, Any]:
 
 
 def _entries(kind: Any, prefix: str) -> Iterator[tuple[Any, str, Any]]:
-    """Each field of a record, its name in files, which its metadata may have as ``entry``, and its type, never None."""
+    """Each field of a record, its name in files, and its type, never None.
+
+    The metadata of a field may have its name as ``entry``, or None where files do not have it.
+    """
     for item in fields(kind):
+        if item.metadata.get("entry", item.name) is None:
+            continue
         hint = _hints(kind)[item.name]
         if typing.get_origin(hint) in (UnionType, typing.Union):
             (hint,) = (option for option in typing.get_args(hint) if option is not NoneType)

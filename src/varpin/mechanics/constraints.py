@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.arrays import Floats
 from varpin.core.arrays import Carried, ConstraintRows, CustomRows, Product, Tied
 from varpin.errors import InputError
-from varpin.mechanics.forces import Described, End, Point, ends_of, require_indices, shown
+from varpin.mechanics.forces import Described, End, Point, ends_of, shown
 from varpin.model import Robot
 from varpin.support.checks import as_floats, count, finite_array, positive, returned, rotation_matrix, tuple_of, word
 from varpin.support.differences import slopes
@@ -51,27 +51,6 @@ class Constraint(Described, ABC):
             UnknownJoint: A joint is no coordinate of the robot.
             UnknownFrame: The robot has no such frame.
         """
-
-
-def bound_constraint(constraint: Constraint, robot: Robot) -> Bound:
-    """``constraint.bind(robot)``, which the core can take: subclasses of users are checked here.
-
-    Raises:
-        InputError: A body, coordinate or vector out of range, or not a label for each row.
-    """
-    bound = constraint.bind(robot)
-    where = f"{type(constraint).__name__}.bind returned"
-    if not isinstance(bound, Bound):
-        raise InputError(f"{where} {bound!r}, which is no Bound")
-    vectors, products, ties, customs = bound.rows
-    carried = (part for vector in vectors for part in vector)
-    aligned = (Product(x, y, 1.0, 0.0) for x, y in bound.aligned)
-    for part in (*carried, *products, *ties, *aligned):
-        require_indices(f"{where} {part!r}", part, robot, len(vectors))
-    rows = len(products) + len(ties) + sum(custom.rows for custom in customs)
-    if len(bound.labels) != rows:
-        raise InputError(f"{where} {len(bound.labels)} labels for {rows} rows")
-    return bound
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -75,40 +75,6 @@ ELEMENTS = {"Armature": Kind(1, False, False)} | {name: Kind(*facts) for name, f
 COUPLINGS = {name: Kind(*facts) for name, facts in coupling_kinds().items()}
 
 
-def bound_force(force: Force, robot: Robot) -> tuple[Element | Coupling, ...]:
-    """``force.bind(robot)``, of which the core can take every element: subclasses of users are checked here.
-
-    Raises:
-        InputError: An element of an unknown kind, with a coordinate or body out of range, or with wrong values.
-    """
-    bound = tuple(force.bind(robot))
-    for each in bound:
-        where = f"{type(force).__name__}.bind returned {each!r}"
-        if not isinstance(each, Element | Coupling):
-            raise InputError(f"{where}, which is neither an Element nor a Coupling")
-        require_indices(where, each, robot)
-        kinds, points = (ELEMENTS, 0) if isinstance(each, Element) else (COUPLINGS, 6)
-        if each.kind not in kinds:
-            raise InputError(f"{where}, of an unknown kind; kinds: {', '.join(kinds)}")
-        count = points + kinds[each.kind].numbers
-        if len(each.values) != count or np.isnan(as_floats("values", each.values)).any():
-            raise InputError(f"{where}, which must have {count} values, none of them NaN")
-    return bound
-
-
-def require_indices(where: str, part: Any, robot: Robot, vectors: int = 0) -> None:
-    """Refuse a part in the form of the core with an index of a coordinate, body or vector that is out of range."""
-    coordinates, bodies = range(robot.dof), range(-1, len(robot.tree.parent))
-    ranges = {"coordinate": coordinates, "follower": coordinates, "leader": coordinates}
-    ranges |= {"body": bodies, "a": bodies, "b": bodies, "x": range(vectors), "y": range(vectors)}
-    for name, index in part._asdict().items():
-        if name in ranges and (not isinstance(index, int | np.integer) or index not in ranges[name]):
-            allowed = ranges[name]
-            raise InputError(
-                f"{where}: its {name} must be an integer from {allowed.start} to {allowed.stop - 1}, got {index!r}"
-            )
-
-
 def kept(name: str, value: Any) -> Any:
     """An immutable copy of a parameter."""
     if value is None or isinstance(value, str) or callable(value):

@@ -145,7 +145,7 @@ def without(scene: Scene, joints: Mapping[str, float] | Collection[str]) -> Scen
     held = dict(joints) if isinstance(joints, Mapping) else dict.fromkeys(joints, 0.0)
     for name in held:
         if name not in names:
-            raise UnknownJoint(str(name), names, "without")
+            raise UnknownJoint(str(name), names, "without: the robot has no joint")
     if not held:
         return scene
     noise = scene.noise.diffusion

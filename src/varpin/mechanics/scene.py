@@ -25,20 +25,17 @@ from varpin.mechanics.constraints import (
     Constraint,
     CustomConstraint,
     KinematicInput,
-    bound_constraint,
     constraints_of,
     joined,
 )
 from varpin.mechanics.custom import CustomForce, CustomForces
 from varpin.mechanics.description import description_constraints
 from varpin.mechanics.forces import (
-    ELEMENTS,
     CoulombFriction,
     Force,
     JointDamper,
     JointSpring,
     JointStop,
-    bound_force,
     dissipates,
     forces_of,
     keeps_energy,
@@ -65,6 +62,8 @@ _OF_TREE = ("center", "inertia", "rotation", "translation", "ratio", "offset")
 _OF_JOINTS = ("damping", "stiffness", "rest", "armature")
 # Largest constraint residual of a given configuration, and of a start that is projected without request [m or rad].
 _OFF, CORRECTED = 1e-6, 0.02
+# Gravity that no planet has, such as 9810 [m/s^2].
+_HEAVY = 100.0
 # Rank tolerance of the constraint Jacobian, relative to its largest singular value.
 _RANK = 1e-9
 # Forces that act only if the scene has them, by their names in a report.
@@ -165,7 +164,7 @@ class Scene(Frozen):
         values: dict[str, Any] = {"robot": robot, "gravity": _gravity(gravity, robot)}
         values |= _forces(robot, forces, damping, friction, stiffness, rest)
         values["constraints"] = given_constraints(robot, constraints)
-        bound, order = joined([bound_constraint(constraint, robot) for constraint in values["constraints"]])
+        bound, order = joined([constraint.bind(robot) for constraint in values["constraints"]])
         inputs = [tie.follower for tie in filter(_is_input, bound.rows.ties)]
         driven = _driven(robot, _actuation(robot, actuation), of_kind(values["elements"], "PositionServo"), inputs)
         values["actuation"], bound = _with_rates(driven, bound)
@@ -442,7 +441,7 @@ class Scene(Frozen):
         fields = self.diffusion
         return mechanism(
             self.robot.tree,
-            **(self._constrained_tree() if self.constraints else {}),
+            periodic=self._periodic(),
             group=self.group,
             groups=int(self.group.max()) + 1,
             ends=np.array([self.robot.dof]) if self.constraints else block_ends(self.group),
@@ -459,17 +458,13 @@ class Scene(Frozen):
             centers=fields.center,
         )
 
-    def _constrained_tree(self) -> dict[str, NDArray[np.int64]]:
-        """Fields of the tree that differ under constraints."""
-        tree, rows = self.robot.tree, self.bound_constraints.rows
-        # Constraints do work on light parts, so these have no energy balance of their own.
-        changed = {"loads": tree.loads[:0], "carried": tree.carried[:0]}
-        # Ties, and possibly custom constraints, are not periodic in a full turn.
-        periodic = tree.periodic.copy()
+    def _periodic(self) -> NDArray[np.int64]:
+        """Which coordinates are periodic in a full turn (n,): no tied ones, and none under custom constraints."""
+        rows, periodic = self.bound_constraints.rows, self.robot.tree.periodic.copy()
         periodic[[c for tie in rows.ties for c in (tie.follower, tie.leader)]] = 0
         if rows.customs:
             periodic[:] = 0
-        return changed | {"periodic": periodic}
+        return periodic
 
     @cached_property
     def bounds(self) -> Floats:
@@ -509,19 +504,22 @@ class Scene(Frozen):
         The noise is stored as intensities (n, k); its factors of the controls are reduced to their norm. A
         :class:`varpin.CustomNoise` is not stored.
         """
-        tree = self.robot.tree
         values = {name: getattr(self, name) for name in ("gravity", *_OF_JOINTS, "actuation")}
-        values |= {name: getattr(tree, name) for name in _OF_TREE}
-        for kind in (kind for kind in ELEMENTS if kind not in _SUMMED):
-            rows = [(each.coordinate, *each.values) for each in of_kind(self.elements, kind)]
-            values[kind] = np.array(rows) if rows else np.zeros((0, 0))
-        for kind in dict.fromkeys(each.kind for each in self.couplings):
-            ends = [(each.a, each.b, *each.values) for each in self.couplings if each.kind == kind]
-            values[kind] = np.array(ends, dtype=np.float64)
-        if self.custom is not None:
-            # Functions are stored as their number only.
-            values["functions"] = np.array([float(len(self.custom.parts))])
-        values |= _numbers_of(self.bound_constraints.rows)
+        values |= {name: getattr(self.robot.tree, name) for name in _OF_TREE}
+        rows: list[tuple[str, Sequence[float]]] = [
+            (each.kind, (each.coordinate, *each.values)) for each in self.elements if each.kind not in _SUMMED
+        ]
+        rows += [(each.kind, (each.a, each.b, *each.values)) for each in self.couplings]
+        # Functions are stored as their number only.
+        rows += [("functions", [len(self.custom.parts)])] if self.custom is not None else []
+        constraints = self.bound_constraints.rows
+        for product in constraints.products:
+            ends = (*constraints.vectors[product.x], *constraints.vectors[product.y])
+            places = [number for end in ends for number in (end.body, float(end.direction), *end.place)]
+            rows.append(("constraints.between", [product.factor, product.constant, *places]))
+        rows += [("constraints.ties", (t.follower, t.leader, t.rate, *t.coefficients)) for t in constraints.ties]
+        rows += [("constraints.custom", [own.rows]) for own in constraints.customs]
+        values |= _tables(rows)
         if self.noise.diffusion is not None:
             fields = self.noise.diffusion
             values |= {"noise.constant": fields.constant, "noise.control": np.linalg.norm(fields.control, axis=2)}
@@ -612,25 +610,15 @@ def _unowned(rows: ConstraintRows) -> ConstraintRows:
     )
 
 
-def _numbers_of(rows: ConstraintRows) -> dict[str, Floats]:
-    """The numbers of constraints by the names of :attr:`Scene.values`; kinds without rows are left out."""
-    found: dict[str, Floats] = {}
-    products: list[float] = []
-    for product in rows.products:
-        products += [product.factor, product.constant]
-        for part in (*rows.vectors[product.x], *rows.vectors[product.y]):
-            products += [part.body, float(part.direction), *part.place]
-    if products:
-        found["constraints.between"] = np.array(products)
-    if rows.ties:
-        most = max(len(tie.coefficients) for tie in rows.ties)
-        table = [
-            (t.follower, t.leader, *t.coefficients, *[0.0] * (most - len(t.coefficients)), t.rate) for t in rows.ties
-        ]
-        found["constraints.ties"] = np.array(table, dtype=np.float64)
-    if rows.customs:
-        found["constraints.custom"] = np.array([float(factor.rows) for factor in rows.customs])
-    return found
+def _tables(rows: Sequence[tuple[str, Sequence[float]]]) -> dict[str, Floats]:
+    """Rows of numbers by name as one array for each name; zeros fill short rows."""
+    tables = {}
+    for name in dict.fromkeys(name for name, _ in rows):
+        own = [row for each, row in rows if each == name]
+        table = tables[name] = np.zeros((len(own), max(map(len, own))))
+        for row, numbers in zip(table, own, strict=True):
+            row[: len(numbers)] = numbers
+    return tables
 
 
 def refuse_constraints(
@@ -688,22 +676,14 @@ def same(one: Floats, other: Floats) -> bool:
 
 
 def differences(scene: Scene, values: Mapping[str, Floats], *, noise: bool) -> list[str]:
-    """What differs between a scene and the one of these :attr:`Scene.values`, with ``noise`` or without, in words."""
-    found = []
+    """The names of the values in which a scene differs from :attr:`Scene.values`, with ``noise`` or without."""
+    found, none = [], np.zeros(0)
     for name in dict.fromkeys((*values, *scene.values)) if values else ():
-        before, now = (given.get(name, np.zeros(0)) for given in (values, scene.values))
-        lacks = not (before.size and now.size)
+        before, now = values.get(name, none), scene.values.get(name, none)
         # A CustomNoise has no numbers.
-        if same(before, now) or (name.startswith("noise.") and (lacks or not noise)):
-            continue
-        what = f"the robot's {name}" if name in _OF_TREE else name
-        if lacks:
-            what += f" (none in the {'motion' if now.size else 'scene'})"
-        elif before.shape == now.shape:
-            at = np.unravel_index(int(np.abs(now - before).argmax()), now.shape)
-            joint = f" at joint {scene.robot.joint_names[at[0]]!r}" if name in _OF_JOINTS else ""
-            what += f" ({before[at]:.6g} in the motion, {now[at]:.6g} in the scene{joint})"
-        found.append(what)
+        known = not name.startswith("noise.") or (noise and before.size and now.size)
+        if known and not same(before, now):
+            found.append(f"the robot's {name}" if name in _OF_TREE else name)
     return found
 
 
@@ -725,7 +705,9 @@ def _gravity(gravity: ArrayLike | bool, robot: Robot) -> Floats:
             f"gravity is a vector in world axes, z up [m/s^2], got the number {float(given):g}; did you mean "
             f"gravity={meant}?"
         )
-    return finite_array("gravity", given, (3,))
+    if np.linalg.norm(vector := finite_array("gravity", given, (3,))) > _HEAVY:
+        logger.warning("gravity = %s m/s^2 is ten times that of the Earth and more: is it in mm/s^2?", vector.tolist())
+    return vector
 
 
 def _warn_of_description(robot: Robot, name: str, what: str, *, gives: bool, asked: bool, decided: bool) -> None:
@@ -786,7 +768,7 @@ def _forces(
         *([CoulombFriction(dry)] if dry.any() else []),
         *given,
     )
-    bound = [each for force in given for each in bound_force(force, robot)]
+    bound = [each for force in given for each in force.bind(robot)]
     elements = [each for each in bound if isinstance(each, Element)]
     for side, name in enumerate(("lower", "upper")):
         ends = positions[f"the {name} end of the JointStop"] = np.zeros(robot.dof)

@@ -178,7 +178,7 @@ def _with_rotors(robot: Robot, armature: JointValues) -> Robot:
         if name in names:
             armatures[names.index(name)] = value
         elif name not in robot.locked:
-            raise UnknownJoint(str(name), names, "armature")
+            raise UnknownJoint(str(name), names, "armature: the robot has no joint")
     values = np.array(model.armature)
     values[indices] = armatures
     model.armature = values
@@ -198,7 +198,7 @@ def _locks(robot: Robot, lock: Mapping[str, ArrayLike] | None, keep: Sequence[st
     leaders = {model.names[tie.follower]: model.names[tie.leader] for tie in robot.ties}
     for name in keep:
         if name not in joint_index(model):
-            raise UnknownJoint(str(name), joint_index(model), f"keep of robot {robot.name!r}")
+            raise UnknownJoint(str(name), joint_index(model), f"keep: robot {robot.name!r} has no joint")
         if name in given:
             raise InputError(f"joint {name!r} is in keep and in lock")
         if leaders.get(name, name) not in keep:
@@ -232,7 +232,7 @@ def hold_joints(robot: Robot, lock: Mapping[str, ArrayLike]) -> Robot:
     positions: dict[int, Floats] = {}
     for name, value in lock.items():
         if name not in index:
-            raise UnknownJoint(str(name), index, f"lock of robot {robot.name!r}")
+            raise UnknownJoint(str(name), index, f"lock: robot {robot.name!r} has no joint")
         joint = index[name]
         if joint in leaders:
             leader = model.names[leaders[joint].leader]

@@ -156,7 +156,7 @@ class Robot(Frozen):
             UnknownJoint: The robot has no such coordinate.
         """
         if not isinstance(joint, str) or joint not in self.joint_names:
-            raise UnknownJoint(str(joint), self.joint_names, f"robot {self.name!r}")
+            raise UnknownJoint(str(joint), self.joint_names, f"robot {self.name!r} has no joint")
         return self.joint_names.index(joint)
 
     @property
@@ -184,7 +184,7 @@ class Robot(Frozen):
         q = joint_array("others", others, self.joint_names, uniform=True)
         found = [state for state in self.group_states if name in (state.name, f"{state.group}/{state.name}")]
         if not found:
-            raise UnknownPosture(name, self.postures, self.name)
+            raise UnknownPosture(name, self.postures, f"robot {self.name!r} has no posture")
         positions: dict[str, float] = {}
         for joint, position in (entry for state in found for entry in state.positions):
             if joint in self.joint_names:

@@ -43,5 +43,6 @@ def frame_names(option: str, robots: Sequence[Robot], names: bool | str | Sequen
             raise InputError(f"{option} must be names of frames, got {name!r}")
         if not any(robot.free_model.existFrame(name) for robot in robots):
             known = dict.fromkeys(frame.name for robot in robots for frame in robot.free_model.frames)
-            raise UnknownFrame(name, known, *(robot.name for robot in robots), option=option)
+            owners = ", ".join(repr(robot.name) for robot in robots)
+            raise UnknownFrame(name, known, f"{option}: no frame of robot {owners} is")
     return [tuple(name for name in wanted if robot.free_model.existFrame(name)) for robot in robots]

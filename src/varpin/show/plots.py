@@ -320,7 +320,7 @@ def _of_controls(trajectory: Trajectory, robot: Robot | None) -> tuple[list[Line
             lines[control] = (positions if joint in placed else forces)[joint]
     for row in inputs:
         # The velocity of a cubic input is a control of its own, whose column is 0.
-        joint, control = int(row[0]), int(row[-1])
+        joint, control = int(row[0]), int(row[2])
         if 0 <= control < len(lines) and 0 <= joint < len(rates) and not actuation[:, control].any():
             joints[control], lines[control] = joint, rates[joint]
     return lines, joints

@@ -19,7 +19,7 @@ from numpy.polynomial.legendre import legvander
 
 from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands
-from varpin.errors import ControlError, InputError, UnknownJoint
+from varpin.errors import ControlError, InputError
 from varpin.finding import Finding
 from varpin.mechanics.scene import Scene
 from varpin.signals.commands import Times, changing, open_loop, prescribing
@@ -302,5 +302,5 @@ def _called(
         raise ControlError(step, time, f"{name} raised {error!r}") from error
     try:
         return read(value)
-    except (InputError, UnknownJoint) as error:
+    except InputError as error:
         raise ControlError(step, time, str(error)) from None

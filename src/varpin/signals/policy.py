@@ -5,7 +5,7 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,6 +27,9 @@ from varpin.support.checks import (
     word,
 )
 from varpin.support.frozen import Frozen
+
+if TYPE_CHECKING:
+    from varpin.integrators import Integrator
 
 
 @dataclass(frozen=True)
@@ -127,6 +130,8 @@ class LinearPolicy(Frozen):
         joints: The joint whose force, or servo position, each control is; None where they are unknown.
         servos: The joints whose controls are positions; None where they are unknown.
         linear: Whether controls are linear in time over each interval, from ``before`` on, instead of constant.
+        integrator: The integrator of motions under the policy where none is given: that of a plan under noise, as its
+            margins are for it; else None.
     """
 
     u: Floats
@@ -142,6 +147,7 @@ class LinearPolicy(Frozen):
     joints: tuple[str, ...] | None
     servos: tuple[str, ...] | None
     linear: bool
+    integrator: Integrator | None
 
     def __init__(
         self,
@@ -159,6 +165,7 @@ class LinearPolicy(Frozen):
         joints: Sequence[str] | None = None,
         servos: Sequence[str] | None = None,
         linear: bool = False,
+        integrator: Integrator | None = None,
     ) -> None:
         """Make a policy of the attributes.
 
@@ -211,6 +218,7 @@ class LinearPolicy(Frozen):
             joints=names,
             servos=None if servos is None else tuple(servos),
             linear=bool(linear),
+            integrator=integrator,
         )
         for array in (self.u, self.gains, self.reference, changes, expected, start):
             if array is not None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -36,6 +35,7 @@ from varpin.simulation.law import Law, law_of
 from varpin.simulation.limits import beyond_limits
 from varpin.simulation.spectrum import contact_rate, fastest_rate, speed_scales, travel_scales
 from varpin.simulation.start import finer
+from varpin.simulation.velocity_noise import wrong_spread
 from varpin.trajectory import Trajectory
 
 # Errors from which on a motion is told of: of q as a share of the largest travel of its kind, of v as a share of the
@@ -81,12 +81,14 @@ def check(
         restart: Steps after which the repetition begins anew at a node of the motion, where a controller has corrected
             the errors before it; 0 for none.
         known: The error, if it is known (N + 1, n): nothing is repeated.
-        hold: The period of a control law in steps, 0 for none. Where a repetition under the recorded controls is far
-            off, and the record tells the law, another one has its feedback.
+        hold: The period of a control law in steps, 0 for none. Where the record tells the law, it acts on the
+            repetition; else its recorded values are held.
     """
     function = controls if isinstance(controls, Sampled) else None
     extremes = None if function is None else function.whole.extremes
     limits = beyond_limits(scene, trajectory, extremes)
+    if trajectory.noisy:
+        limits = [*wrong_spread(scene, integrator, trajectory), *limits]
     if not trajectory.steps:
         known = np.zeros_like(trajectory.q)
     if known is not None:
@@ -99,7 +101,11 @@ def check(
     calls = isinstance(controls, OpenLoop) and closer(scene, integrator, trajectory, sampled=True)[1] > 1
     resolved = function is None or left_by_stages(function, len(integrator.stage_times)) <= _RESOLVED
     proven = proven_error(scene, integrator, trajectory) if resolved and not (held_mean or calls) else None
-    repeat = functools.partial(repeated, scene, integrator, trajectory, controls, restart)
+
+    def repeat() -> tuple[Floats, Floats, float]:
+        law = law_of(scene, trajectory, hold) if hold else None
+        return repeated(scene, integrator, trajectory, controls, restart, law, hold)
+
     found: tuple[Finding, ...] = ()
     if proven is not None:
         motion = trajectory.with_error(lambda: distance(repeat(), trajectory)[0], proven)
@@ -107,9 +113,6 @@ def check(
         try:
             off, speed_off = distance(repeat(), trajectory)
             found = error_findings(scene, integrator, trajectory, off, speed_off, controls, hold)
-            if found and hold and (law := law_of(scene, trajectory, hold)) is not None:
-                off, speed_off = distance(repeat(law=_limited(scene, law, trajectory, hold), hold=hold), trajectory)
-                found = error_findings(scene, integrator, trajectory, off, speed_off, controls, hold)
             found = found or short_forces(scene, integrator, trajectory)
         except (CustomForceError, CustomConstraintError) as error:
             off = np.full_like(trajectory.q, np.nan)
@@ -168,13 +171,12 @@ def repeated(
     trajectory: Trajectory,
     controls: Controls | Commands = None,
     restart: int = 0,
-    law: Callable[[Floats, Floats], Floats] | None = None,
-    hold: int = 1,
+    law: Law | None = None,
+    hold: int = 0,
 ) -> tuple[Floats, Floats, float]:
     """A motion repeated by the method of :func:`closer`: q and v (N + 1, n), NaN where it failed; and its share.
 
-    The arguments are those of :func:`check`. A ``law`` of q and v (n,) replaces the controls: it acts on the states of
-    the repetition, every ``hold`` steps.
+    The arguments are those of :func:`check`. A ``law`` replaces the controls, every ``hold`` steps.
     """
     fed = isinstance(controls, LinearPolicy) or (isinstance(controls, Commands) and len(controls.gains) > 0)
     method, parts, left = closer(scene, integrator, trajectory, fed=fed, sampled=isinstance(controls, OpenLoop))
@@ -196,7 +198,7 @@ def repeated(
         if restart and first:
             state, _ = method.start(scene, trajectory.q[done : done + 1], trajectory.v[done : done + 1])
         if law is not None:
-            block = open_loop(law(q[done], v[done])[None])._replace(hold=taken.stop - first)
+            block = open_loop(law.control(scene, q[done], v[done])[None])._replace(hold=taken.stop - first)
         else:
             before = last.u[None, -1] if first else None
             block = rows(commands, first // commands.hold, -(-taken.stop // commands.hold), before)
@@ -246,16 +248,6 @@ def _commands(
         return held
     within = in_parts(trajectory.u_stages, integrator.stage_times, parts, times)
     return prescribing(scene, changing(within, times), held.u)
-
-
-def _limited(scene: Scene, law: Law, trajectory: Trajectory, hold: int) -> Callable[[Floats, Floats], Floats]:
-    """A law within the limits of the record: the ends of its range, where it is there for more than a period."""
-    u = trajectory.u
-    low, high = (
-        np.where((u == end).sum(axis=0) > hold, end, far)
-        for end, far in ((u.min(axis=0), -np.inf), (u.max(axis=0), np.inf))
-    )
-    return lambda q, v: np.clip(law.control(scene, q, v), low, high)
 
 
 def noise_unknown(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bool:

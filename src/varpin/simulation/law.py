@@ -10,6 +10,7 @@ from varpin.arrays import Floats, Integers
 from varpin.errors import LinearizationError
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
+from varpin.signals.commands import no_limits
 from varpin.trajectory import Trajectory
 
 # Least nodes of a fit, spread over the motion, but four a joint at least: 30 to 300 give the same.
@@ -29,17 +30,20 @@ class Law:
         c: (m,).
         directions: Of (q, v), in which the motion tells the law (2n, r).
         near: A configuration of the motion (n,) [rad or m].
+        limits: The ends of the range of each control where it is there more than once (2, m); else infinite.
     """
 
     K: Floats
     c: Floats
     directions: Floats
     near: Floats
+    limits: Floats
 
     def control(self, scene: Scene, q: Floats, v: Floats) -> Floats:
-        """The control (m,) at a state (n,), (n,), not limited."""
-        found: Floats = self.K @ np.concatenate([q, v, lagrangian_jet(scene, q, np.zeros_like(q)).Lq]) + self.c
-        return found
+        """The control (m,) at a state (n,), (n,)."""
+        found = self.K @ np.concatenate([q, v, lagrangian_jet(scene, q, np.zeros_like(q)).Lq]) + self.c
+        limited: Floats = np.clip(found, *self.limits)
+        return limited
 
 
 def law_of(scene: Scene, trajectory: Trajectory, hold: int) -> Law | None:
@@ -64,7 +68,10 @@ def decisions(trajectory: Trajectory, hold: int) -> tuple[Integers, Floats, Floa
 def _law(scene: Scene, x: Floats, u: Floats) -> Law | None:
     """The law from all nodes or, where it clips, of each control from the nodes at which it is inside its limits."""
     law = fitted_law(scene, x, u)
-    clipped = np.any([end & (end.sum(axis=0) > 1) for end in (u == u.min(axis=0), u == u.max(axis=0))], axis=0)
+    ends = np.array([u.min(axis=0), u.max(axis=0)])
+    at_end = u == ends[:, None]
+    often = at_end.sum(axis=1) > 1
+    clipped = (at_end & often[:, None]).any(axis=0)
     if law is not None or not clipped.any():
         return law
     laws = [fitted_law(scene, x[~rows], u[~rows, k : k + 1]) for k, rows in enumerate(clipped.T)]
@@ -73,7 +80,8 @@ def _law(scene: Scene, x: Floats, u: Floats) -> Law | None:
     if len(known) < len(laws):
         return None
     K, c = np.concatenate([law.K for law in known]), np.concatenate([law.c for law in known])
-    return Law(K, c, known[0].directions, known[0].near)
+    limits = np.where(often, ends, [[-np.inf], [np.inf]])
+    return Law(K, c, known[0].directions, known[0].near, limits)
 
 
 def fitted_law(scene: Scene, x: Floats, u: Floats) -> Law | None:
@@ -89,7 +97,8 @@ def fitted_law(scene: Scene, x: Floats, u: Floats) -> Law | None:
     if fit is None:
         return None
     K, c, directions = fit
-    return Law(np.pad(K, ((0, 0), (0, 3 * n - K.shape[1]))), c, directions[: 2 * n], x[0, :n])
+    K = np.pad(K, ((0, 0), (0, 3 * n - K.shape[1])))
+    return Law(K, c, directions[: 2 * n], x[0, :n], no_limits(len(K)))
 
 
 def _affine(x: Floats, u: Floats) -> tuple[Floats, Floats, Floats] | None:

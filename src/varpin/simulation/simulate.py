@@ -83,11 +83,12 @@ def simulate(
             step. A law is a digital controller: it is called once at the start of each of its periods, with the time
             and state of that node, and its value is held over the period.
         period: Of a control law, in steps.
-        integrator: If left out, it is chosen once, by the rates at the start and in all joint stops:
-            ``Radau(stages=4)`` where dampers, dry friction or servos are more than twice as fast as the step and the
-            scene has no constraints; ``Gauss(stages=4)`` where springs turn a mode by more than 0.4 rad in a step; else
-            ``Gauss(stages=2)``. A CustomForce has no part in the choice. ``Midpoint(kick="held")`` where noise is
-            drawn; with a tolerance, the cheapest of all. The check names a better one where the choice was not enough.
+        integrator: If left out, that of the policy of a plan under noise, or chosen by the rates at the start and in
+            all joint stops: ``Radau(stages=4)`` where dampers, dry friction or servos are more than twice as fast as
+            the step and the scene has no constraints; ``Gauss(stages=4)`` where springs turn a mode by more than 0.4
+            rad in a step; else ``Gauss(stages=2)``. A CustomForce has no part in the choice. ``Midpoint(kick="held")``
+            where noise is drawn; with a tolerance, the cheapest of all. The check names a better one where the choice
+            was not enough.
 
     Other Args:
         rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero, with a
@@ -161,6 +162,8 @@ def simulate(
         # Given without those for slopes of the controls, which are zero then.
         width = scene.processes
     dw = wiener_increments(width, dt, steps, rng, increments)
+    if integrator is None and isinstance(controls, LinearPolicy):
+        integrator = controls.integrator
     if integrator is None:
         integrator = usual_integrator(scene, q0, v0, dt, noisy=len(dw) > 0)
     if isinstance(controls, OpenLoop) and not isinstance(controls, Sampled):

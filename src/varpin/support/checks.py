@@ -104,7 +104,7 @@ def joint_array(
     array = np.full(len(joints), absent)
     for joint, number in value.items():
         if joint not in joints:
-            raise UnknownJoint(str(joint), joints, name, lack)
+            raise UnknownJoint(str(joint), joints, f"{name}: {lack}")
         array[joints.index(joint)] = (real if limit else finite)(f"{name}[{joint!r}]", number)
     return array
 

@@ -15,7 +15,7 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
-#include <memory>
+#include <optional>
 #include <vector>
 
 #include "varpin/compensated.hpp"
@@ -72,13 +72,14 @@ class Collocation {
             coupled_q.resize(entries(stages * n, n));
             coupled_v.resize(stages * n * n);
         }
-        if (dense || stages > StepElimination::most_stages || !eliminates(mechanism, stages)) {
+        // Couplings fill entries of the matrix for which elimination has no form.
+        if (dense || stages > 1 || mechanism.couplings.any() || !eliminates(mechanism.tree)) {
             allocate();
             return;
         }
-        element_curvature.resize(stages * n);
-        diagonal.resize(stages * stages * n);
-        elimination = elimination_of(mechanism, tableau);
+        element_curvature.resize(n);
+        diagonal.resize(n);
+        elimination.emplace(mechanism, tableau);
     }
 
     const Mechanism& mechanism;
@@ -86,9 +87,9 @@ class Collocation {
     const Kernels& kernels;
     int n;
     int stages;
-    std::vector<Jet<double>> stage;                // without matrices if there is an elimination
-    std::unique_ptr<StepElimination> elimination;  // at the iterate of the last factors; null where there are matrices
-    std::vector<double> V = zeros(stages, n);      // stage velocities: the guess, then the root
+    std::vector<Jet<double>> stage;              // without matrices if there is an elimination
+    std::optional<StepElimination> elimination;  // of one stage, at the iterate of the last factors
+    std::vector<double> V = zeros(stages, n);    // stage velocities: the guess, then the root
     std::vector<double> Q = zeros(stages, n);
     std::vector<double> force_sum = zeros(stages, n);   // L_q + F
     std::vector<double> force_rest = zeros(stages, n);  // of correct_forces; less than the last digit of `force_sum`
@@ -122,12 +123,15 @@ class Collocation {
         return outcome;
     }
 
-    bool eliminated() const { return elimination != nullptr; }
+    bool eliminated() const { return elimination.has_value(); }
 
     // Factor N from the stages' jets; false where its determinant is not positive.
     bool factor(double h) {
         if (!eliminated()) return factor_blocks(h);
-        write_diagonal(h);
+        for (int c = 0; c < n; ++c) {
+            diagonal[c] = mechanism.tree.armature[c];
+            if (mechanism.forces.any()) diagonal[c] += element_entry(h, 0, 0, c, true);
+        }
         return elimination->factor(h, diagonal.data());
     }
 
@@ -138,7 +142,7 @@ class Collocation {
         double total = 0.0;
         for (int i = 0; i < stages; ++i) {
             const JointForce<double>& force = acting[i * n + c];
-            const double by_own_q = force.by_q + (eliminated() ? element_curvature[i * n + c] : 0.0);
+            const double by_own_q = force.by_q + (eliminated() ? element_curvature[c] : 0.0);
             total -= tableau.b[i] * (by_rate * force.by_v + by_position * by_own_q);
         }
         return total;
@@ -223,8 +227,8 @@ class Collocation {
     std::vector<double> change, local;
     std::vector<double> turning;  // (n) rotation of bodies per unit of a coordinate; infinite for a coordinate that
                                   // translates a body on a rotating one, where its product is NaN without motion
-    std::vector<double> element_curvature;  // (s, n) of the elements' potentials, if there is an elimination
-    std::vector<double> diagonal;           // (s, s, n) of N, without the contributions of bodies in an elimination
+    std::vector<double> element_curvature;  // (n) of the elements' potentials, if there is an elimination
+    std::vector<double> diagonal;           // (n) of N, without the contributions of bodies in an elimination
 
     Outcome iterate(double h, const Start& start, double tolerance, bool jets_wanted, Effort& effort) {
         double before = infinity, worst = infinity;
@@ -355,12 +359,8 @@ class Collocation {
     // Compute the matrices of the jets at an iterate of elimination, which does not need them.
     void write_jets() {
         if (lu.empty()) allocate();
-        for (int i = 0; i < stages; ++i) kernels.jet(mechanism, &Q[i * n], &V[i * n], stage[i]);
-        take_over();
-    }
-
-    void take_over() {
-        for (int i = 0; i < stages && elimination; ++i) elimination->take(i, stage[i]);
+        kernels.jet(mechanism, Q.data(), V.data(), stage[0]);
+        elimination->take(stage[0]);
     }
 
     [[gnu::always_inline]] inline void move_stages(const int stages, double h, const Start& start) {
@@ -382,7 +382,7 @@ class Collocation {
                 kernels.first_order(mechanism, &Q[i * n], &V[i * n], stage[i]);
             }
         }
-        if (second) take_over();
+        if (second && eliminated()) elimination->take(stage[0]);
         if (mechanism.pushes()) find_forces(start);
         (second ? effort.jets : effort.sweeps) += stages;
     }
@@ -397,11 +397,8 @@ class Collocation {
         }
         if (!eliminated()) return;
         std::fill(element_curvature.begin(), element_curvature.end(), 0.0);
-        for (int i = 0; i < stages; ++i) {
-            double* curvature = &element_curvature[i * n];
-            mechanism.forces.potentials(
-                &Q[i * n], [curvature](int c, const Potential<double>& element) { curvature[c] += element.curvature; });
-        }
+        mechanism.forces.potentials(
+            Q.data(), [&](int c, const Potential<double>& element) { element_curvature[c] += element.curvature; });
     }
 
     // Add the external force to those of elements at stage i. Nothing but F itself depends on it.
@@ -416,29 +413,16 @@ class Collocation {
         }
     }
 
-    // The contribution of elements to N_im of coordinate c: of F and, with `potentials`, of their potentials, if the
-    // jets do not have these.
-    double element_entry(double h, int i, int m, int c, bool potentials) const {
+    // The contribution of elements to N_im of coordinate c: of F and, with `potentials`, which elimination needs, of
+    // their potentials.
+    double element_entry(double h, int i, int m, int c, bool potentials = false) const {
         double by_position = 0.0;
         for (int j = 0; j < stages; ++j) {
             double share = tableau.force[i * stages + j] * acting[j * n + c].by_q;
-            if (potentials) share += tableau.gradient[i * stages + j] * element_curvature[j * n + c];
+            if (potentials) share += tableau.gradient[0] * element_curvature[c];
             by_position += tableau.a[j * stages + m] * share;
         }
         return -h * tableau.force[i * stages + m] * acting[m * n + c].by_v - h * h * by_position;
-    }
-
-    void write_diagonal(double h) {
-        const bool elements = mechanism.forces.any();
-        for (int i = 0; i < stages; ++i) {
-            for (int m = 0; m < stages; ++m) {
-                for (int c = 0; c < n; ++c) {
-                    double entry = i == m ? mechanism.tree.armature[c] : 0.0;
-                    if (elements) entry += element_entry(h, i, m, c, true);
-                    diagonal[(i * stages + m) * n + c] = entry;
-                }
-            }
-        }
     }
 
     // r(V); returns its largest entry in rounding units of its terms.
@@ -508,7 +492,7 @@ class Collocation {
                     const double factor = h * tableau.a[i * stages + j];
                     const double* A = &stage[i].A[row * n + block.begin];
                     for (int c = 0; c < width; ++c) line[j * width + c] += factor * A[c];
-                    if (mechanism.forces.any()) line[j * width + r] += element_entry(h, i, j, row, false);
+                    if (mechanism.forces.any()) line[j * width + r] += element_entry(h, i, j, row);
                     if (coupled()) add_coupled_row(h, i, j, row, block, line + j * width);
                 }
                 const double* M = &stage[i].M[row * n + block.begin];
@@ -529,7 +513,7 @@ class Collocation {
             for (int c = block.begin; c < block.end; ++c) {
                 line[c] = ahead * A[row + c] - behind * (ahead * Lqq[row + c] + A[c * n + r]);
             }
-            if (elements) line[r] += element_entry(h, 0, 0, r, false);
+            if (elements) line[r] += element_entry(h, 0, 0, r);
             if (coupled()) add_coupled_row(h, 0, 0, r, block, line + block.begin);
             for (int c = block.begin; c < block.end; ++c) line[c] += M[row + c];
         }
@@ -560,20 +544,6 @@ class Collocation {
         return total;
     }
 
-    // (A_i' + F_v,i) x_i + (L_qq,i + F_q,i) h sum_j a_ij x_j into `change`, for x in `delta`, the last solution.
-    void change_of_force(double h, std::vector<double>& change) {
-        elimination->change_of_force(delta.data(), change.data());
-        if (!mechanism.forces.any()) return;
-        for (int i = 0; i < stages; ++i) {
-            for (int c = 0; c < n; ++c) {
-                double moved = 0.0;
-                for (int j = 0; j < stages; ++j) moved += tableau.a[i * stages + j] * delta[j * n + c];
-                const int k = i * n + c;
-                change[k] += acting[k].by_v * delta[k] + h * (element_curvature[k] + acting[k].by_q) * moved;
-            }
-        }
-    }
-
     // Correct L_q + F of the stages for the step `delta`, to first order, in `force_rest`. Rounding would take the
     // correction from a sum with `force_sum`; the errors of guesses have a similar sign in every step, and energy
     // drifts.
@@ -599,8 +569,15 @@ class Collocation {
             force_rest[k] += total;
         }
         if (eliminated()) {
-            change_of_force(h, moved);
-            for (int k = 0; k < stages * n; ++k) force_rest[k] += moved[k];
+            elimination->change_of_force(delta.data(), moved.data());
+            for (int c = 0; c < n; ++c) {
+                double total = moved[c];
+                if (mechanism.forces.any()) {
+                    const double slope = element_curvature[c] + acting[c].by_q;
+                    total += acting[c].by_v * delta[c] + h * slope * (tableau.a[0] * delta[c]);
+                }
+                force_rest[c] += total;
+            }
             return;
         }
         for (int i = 0; i < stages; ++i) {

@@ -240,7 +240,7 @@ class VariationalLinearization {
         const Collocation& equation = stepper.equation;
         const int w = 3 * n;
         write_slopes(h, z);
-        stepper.equation.solve_transposed(h, slope.data(), multiplier.data());
+        stepper.equation.solve_transposed(slope.data(), multiplier.data());
         if (start != nullptr) bring_to_start(start);
         for (int i = 0; i < stages; ++i) {
             differentiate_along(h, i, z);

@@ -13,10 +13,7 @@ namespace varpin {
 class StepEquation : public Collocation {
   public:
     StepEquation(const Mechanism& mechanism, const Tableau& tableau, bool dense, const Kernels& kernels = kernels_for<>)
-        : Collocation(mechanism, tableau, dense, kernels), weight(stages, 1.0) {
-        for (const Block& block : blocks_of(mechanism.tree, n))
-            eliminated_columns = eliminated_columns || (eliminated() && block.end - block.begin >= few_columns);
-    }
+        : Collocation(mechanism, tableau, dense, kernels), weight(stages, 1.0) {}
 
     std::vector<double> weight;  // (s) factor of the force f at each stage, for derivatives in f
     bool weighted = false;       // whether any factor is not 1
@@ -36,12 +33,11 @@ class StepEquation : public Collocation {
     // Derivatives at the root, from the jets of its stages: dV (s, n, 3n), and of (q1, p1), all in (q0, p0, f); Jx is
     // (2n, 2n), Jf (2n, n). Only blocks of dV are written.
     void derivatives(double h, std::vector<double>& dV, double* Jx, double* Jf) {
-        if (eliminated_columns) return eliminate_derivatives(h, dV, Jx, Jf);
         if (stages == 1) return kernels.derivatives(*this, h, dV, Jx, Jf);
         derivatives_by_blocks(n, stages, h, dV, Jx, Jf);
     }
 
-    // The same by blocks, without elimination. Numbers of joints and stages may be known at compile time, here and in
+    // The same. Numbers of joints and stages may be known at compile time, here and in
     // the three parts of it.
     template <class Size, class Stages>
     void derivatives_by_blocks(Size n, Stages stages, double h, std::vector<double>& dV, double* Jx, double* Jf) {
@@ -64,8 +60,7 @@ class StepEquation : public Collocation {
     }
 
     // x with N' x = right, after `derivatives`.
-    void solve_transposed(double h, const double* right, double* x) {
-        if (eliminated_columns) factor_blocks(h);
+    void solve_transposed(const double* right, double* x) {
         solve_blocks(right, x, [this](const double* matrix, int size, const int* rows, double* b, double* y) {
             solve_lu_transposed(matrix, size, stages == 1 ? nullptr : rows, b, y);
         });
@@ -84,68 +79,7 @@ class StepEquation : public Collocation {
     friend struct Sized;
     friend class ConstrainedLinearization;
 
-    // Number of columns of a block up to which solving them together with the block's matrix is faster than elimination
-    // column by column. Measured.
-    static constexpr int few_columns = 45;
     std::vector<double> columns, gain;
-    bool eliminated_columns = false;  // of derivatives
-
-    // `derivatives` column by column.
-    void eliminate_derivatives(double h, std::vector<double>& dV, double* Jx, double* Jf) {
-        factor(h);
-        columns.resize(stages * n);
-        for (int k = 0; k < n; ++k) {
-            for (int kind = 0; kind < 3; ++kind) {
-                // With one stage the column of the force is proportional to that of the momentum, just solved for.
-                const double scale =
-                    stages == 1 && kind == 2 ? h * weight[0] * tableau.force[0] * (1.0 + acting[k].by_f) : 1.0;
-                if (stages > 1 || kind < 2) {
-                    right_side(h, kind, k);
-                    solve_factored(residual.data(), delta.data());
-                    change_of_force(h, columns);
-                }
-                double* out = kind == 2 ? Jf + k : Jx + kind * n + k;
-                const int stride = (kind == 2 ? 1 : 2) * n;
-                for (int r = 0; r < n; ++r) {
-                    double q = 0.0, p = 0.0;
-                    for (int i = 0; i < stages; ++i) {
-                        dV[(i * n + r) * 3 * n + kind * n + k] = scale * delta[i * n + r];
-                        q += tableau.b[i] * delta[i * n + r];
-                        p += tableau.b[i] * columns[i * n + r];
-                        if (kind == 0) p += tableau.b[i] * stage[i].Lqq[k * n + r];
-                        if (kind == 0 && r == k) p += tableau.b[i] * acting[i * n + k].by_q;
-                    }
-                    out[r * stride] = h * scale * q;
-                    out[(n + r) * stride] = h * scale * p;
-                }
-                if (kind == 0) out[k * stride] += 1.0;
-                if (kind > 0) out[(n + k) * stride] += kind == 1 ? 1.0 : h * passed(k);
-            }
-        }
-    }
-
-    // Into `residual` dr in one of q0, p0 or f: h sum_j (abar_ij L_qq,j + f_ij F_q,j) - A_i, 1, or h sum_j f_ij w_j
-    // F_f,j with the stages' weights w.
-    void right_side(double h, int kind, int k) {
-        std::fill(residual.begin(), residual.end(), 0.0);
-        for (int i = 0; i < stages; ++i) {
-            double* b = &residual[i * n];
-            double share = 0.0;
-            for (int j = 0; j < stages; ++j) {
-                share += weight[j] * tableau.force[i * stages + j];
-                if (kind > 0) continue;
-                const double* curvature = &stage[j].Lqq[k * n];
-                for (int r = 0; r < n; ++r) b[r] += h * tableau.gradient[i * stages + j] * curvature[r];
-                b[k] += h * tableau.force[i * stages + j] * acting[j * n + k].by_q;
-            }
-            if (kind == 0) {
-                for (int r = 0; r < n; ++r) b[r] -= stage[i].A[r * n + k];
-            } else {
-                b[k] = kind == 1 ? 1.0 : h * share;
-                if (kind == 2) b[k] += h * changed(i, k);
-            }
-        }
-    }
 
     // sum_j f_ij w_j (F_f,j - 1): the change of a constant force in r_i by elements.
     double changed(int i, int c) const {

@@ -1,65 +1,92 @@
-// Elimination (elimination.hpp) of a symmetric matrix, also in trees with mimic joints; and M alone.
-// docs/mathematics.md, "Linear in the number of joints".
+// Elimination (elimination.hpp) of a symmetric matrix, and of M alone. docs/mathematics.md, "Linear in the number of
+// joints".
 #pragma once
 
 #include <algorithm>
-#include <memory>
-#include <optional>
-#include <type_traits>
 #include <vector>
 
 #include "varpin/elimination_rows.hpp"
 #include "varpin/jet.hpp"
 #include "varpin/mechanism.hpp"
-#include "varpin/subtree_sums.hpp"
 
 namespace varpin {
 
-// u = X row + u0, D = d + row . u, and X - u u' / D is passed to the parent. Rows have `size` entries, six for each
-// motion, and then one for each slot of mimic joints. A body with a mimic coordinate passes X, with u added to the row
-// and column of the slot, and row . u and twice the slot's entry of u added to its diagonal. A width is known where
-// there are no mimic joints.
-template <class Width>
+// What bodies pass to their parents during elimination, `entries` numbers each, from the last body to the first. Cells
+// of storage are reused: a chain needs one, which stays in the cache.
+class SubtreeSums {
+  public:
+    SubtreeSums(const Tree& tree, int entries)
+        : entries_(entries), cell_(tree.size(), -1), joins_(tree.size(), 0), leaf_(tree.size(), 1) {
+        int cells = 0;
+        std::vector<int> free;
+        for (int j = tree.size() - 1; j >= 0; --j) {
+            if (cell_[j] < 0) {
+                if (free.empty()) free.push_back(cells++);
+                cell_[j] = free.back();
+                free.pop_back();
+            }
+            const int k = tree.bodies[j].parent;
+            if (k >= 0 && cell_[k] < 0) {
+                cell_[k] = cell_[j];
+                leaf_[k] = 0;
+                continue;
+            }
+            joins_[j] = k >= 0;
+            free.push_back(cell_[j]);
+        }
+        at_.resize(cells * entries);
+    }
+
+    // The sum of the children of body j.
+    double* of(int j) {
+        double* entries = at(j);
+        if (leaf_[j]) std::fill(entries, entries + entries_, 0.0);
+        return entries;
+    }
+    // Pass the contribution of body j to its parent.
+    void hand_on(int j, int parent) {
+        if (!joins_[j]) return;
+        const double* entries = at(j);
+        double* __restrict up = at(parent);
+        for (int k = 0; k < entries_; ++k) up[k] += entries[k];
+    }
+
+  private:
+    int entries_;
+    std::vector<int> cell_;    // of each body; a first child has the cell of its parent
+    std::vector<char> joins_;  // has a cell of its own, which is added to that of its parent
+    std::vector<char> leaf_;   // has no children: its cell is empty
+    std::vector<double> at_;
+
+    double* at(int j) { return at_.data() + cell_[j] * entries_; }
+};
+
+// u = X row + u0, D = d + row . u, and X - u u' / D is passed to the parent, (E3). Rows have six entries for each
+// motion.
+template <int size>
 class SymmetricElimination {
   public:
-    SymmetricElimination(const Tree& tree, const std::shared_ptr<const SubtreeOrder>& order, int size)
-        : tree_(&tree),
-          order_(order),
-          size_(size),
-          width_(detail::even(size + order->mimics.slots)),
-          matrix_(order, width_ * width_),
-          force_(order, width_) {}
+    explicit SymmetricElimination(const Tree& tree) : tree_(&tree), matrix_(tree, size * size), force_(tree, size) {}
 
-    // To be written before body j is eliminated, (size) each: its row, and u0 plus the part of u from its own inertia.
-    double* row(int j) { return row_.data() + width_ * j; }
-    double* u() { return u_.data(); }
+    // To be written before body j is eliminated: its row, and u0 plus the part of u from its own inertia.
+    double* row(int j) { return row_.data() + size * j; }
+    double* u() { return u_; }
 
-    // Eliminate body j, from the last body to the first; false at a pivot that is not positive. `own` adds the
-    // body's own inertias to X.
-    template <class Own>
-    bool eliminate(int j, const double* diagonal, const Own& own) {
+    // Eliminate body j, from the last body to the first; false at a pivot that is not positive.
+    bool eliminate(int j, const double* diagonal, const detail::OwnInertia<size>& own) {
         const Body& link = tree_->bodies[j];
         double* X = matrix_.of(j);
-        std::fill(u_.begin() + size_, u_.end(), 0.0);
-        detail::add_symmetric_product(width_, X, row(j), u_.data());
-        const double along_axis = detail::product(width_, row(j), u_.data());
-        const int slot = slot_of(link.coordinate);
-        if (slot < 0) {
-            const bool last = link.parent < 0 && slots() == 0;
-            if (!take_out(link.coordinate, j, diagonal[link.coordinate] + along_axis, own, last ? nullptr : X))
-                return false;
-            if (last) return true;
-        } else {
-            const int at = size_ + slot;
-            for (int r = 0; r < width_; ++r) X[r * width_ + at] += u_[r];
-            detail::write_sum(width_, X + at * width_, 1.0, u_.data(), X + at * width_);
-            X[at * width_ + at] += along_axis;
-        }
-        if constexpr (std::is_same_v<Width, int>) own.add(X, width_);
-        if (!take_out_mimics(j, diagonal, X)) return false;
-        if (link.origin) detail::keep_linear_rows(size_, 6, width_, X);
+        detail::add_symmetric_product<size>(X, row(j), u_);
+        const double pivot = diagonal[link.coordinate] + detail::product<size>(row(j), u_);
+        pivot_[link.coordinate] = pivot;
+        if (!(pivot > 0.0)) return false;
+        const double inverse = 1.0 / pivot;
+        for (int r = 0; r < size; ++r) answer(j)[r] = u_[r] * inverse;
+        if (link.parent < 0) return true;
+        detail::replace<detail::Kept::upper>(answer(j), detail::Pairs<size>(u_), own, X);
+        if (link.origin) detail::keep_linear_rows<size, 6>(X);
         matrix_.hand_on(j, link.parent);
-        return j > 0 || slots() == 0 || take_out_mimics(-1, diagonal, matrix_.of_ground());
+        return true;
     }
 
     // D of a coordinate: for M, its inertia with its subtree free [kg m^2 or kg].
@@ -68,108 +95,40 @@ class SymmetricElimination {
     // x with the matrix times x = b; x may be b. `share`, unless null, receives the terms of 1/2 b . x, which are not
     // negative: left^2 / (2 D), with `left` the remainder of b_i when the subtree of coordinate i is free.
     void solve(const double* b, double* x, double* share) {
-        const auto substitute = [&](int c, int body, double left, double* z) {
-            x[c] = left / pivot_[c];
-            if (share) share[c] = 0.5 * left * x[c];
-            detail::write_sum(width_, z, left, answer(body), z);
-        };
-        const auto substitute_mimics = [&](int j, double* z) {
-            for (const Mimics::Mimic& mimic : order_->mimics.ending(j)) {
-                double& mimic_force = z[size_ + mimic.slot];
-                substitute(mimic.coordinate, mimic.body, b[mimic.coordinate] - mimic_force, z);
-                mimic_force = 0.0;
-            }
-        };
         for (int j = tree_->size() - 1; j >= 0; --j) {
             const Body& link = tree_->bodies[j];
             double* z = force_.of(j);
-            const double along = detail::product(width_, row(j), z);
-            const int c = link.coordinate, slot = slot_of(c);
-            if (slot < 0) {
-                substitute(c, j, b[c] - along, z);
-            } else {
-                z[size_ + slot] += along;
-            }
-            if (slots() > 0) substitute_mimics(j, z);
-            if (link.origin) detail::keep_linear(size_, 6, z);
+            const int c = link.coordinate;
+            const double left = b[c] - detail::product<size>(row(j), z);
+            x[c] = left / pivot_[c];
+            if (share) share[c] = 0.5 * left * x[c];
+            detail::write_sum<size>(z, left, answer(j), z);
+            if (link.origin) detail::keep_linear<size, 6>(z);
             force_.hand_on(j, link.parent);
         }
-        if (slots() > 0) substitute_mimics(-1, force_.of_ground()), move_mimics(-1, motion_.data(), x);
         for (int j = 0; j < tree_->size(); ++j) {
             const Body& link = tree_->bodies[j];
-            const double* above = motion_.data() + width_ * (link.parent + 1);
-            double* moved = motion_.data() + width_ * (j + 1);
-            if (slots() > 0) {
-                std::copy(above, above + width_, moved);
-                move_mimics(j, moved, x);
-                above = moved;
-            }
-            const int c = link.coordinate;
-            if (slot_of(c) < 0) x[c] -= detail::product(width_, answer(j), above);
-            detail::write_sum(width_, above, x[c], row(j), moved);
+            const double* above = motion_.data() + size * (link.parent + 1);
+            x[link.coordinate] -= detail::product<size>(answer(j), above);
+            detail::write_sum<size>(above, x[link.coordinate], row(j), motion_.data() + size * (j + 1));
         }
     }
 
   private:
-    double* answer(int j) { return answer_.data() + width_ * j; }
-    int slots() const { return std::is_same_v<Width, int> ? order_->mimics.slots : 0; }
-    int slot_of(int coordinate) const { return std::is_same_v<Width, int> ? order_->mimics.slot[coordinate] : -1; }
-
-    // Eliminate coordinate c with its u and D; `solve` needs u / D, which is stored with body j.
-    template <class Own>
-    bool take_out(int c, int j, double pivot, const Own& own, double* X) {
-        pivot_[c] = pivot;
-        if (!(pivot > 0.0)) return false;
-        const double inverse = 1.0 / pivot;
-        for (int r = 0; r < width_; ++r) answer(j)[r] = u_[r] * inverse;
-        if (X) detail::subtract_outer<detail::Kept::upper>(width_, answer(j), u_.data(), own, X);
-        return true;
-    }
-
-    bool take_out_mimics(int j, const double* diagonal, double* X) {
-        if (slots() == 0) return true;
-        for (const Mimics::Mimic& mimic : order_->mimics.ending(j)) {
-            const int at = size_ + mimic.slot, c = mimic.coordinate;
-            std::copy(X + at * width_, X + (at + 1) * width_, u_.begin());
-            const double pivot = diagonal[c] + u_[at];
-            u_[at] = 0.0;
-            if (!take_out(c, mimic.body, pivot, detail::NoInertia{}, X)) return false;
-            detail::clear_slot(at, 1, width_, X);
-        }
-        return true;
-    }
-
-    // In the order opposite to elimination.
-    void move_mimics(int j, double* moved, double* x) {
-        const std::vector<Mimics::Mimic>& ending = order_->mimics.ending(j);
-        for (auto mimic = ending.rbegin(); mimic != ending.rend(); ++mimic) {
-            x[mimic->coordinate] -= detail::product(width_, answer(mimic->body), moved);
-            moved[size_ + mimic->slot] = x[mimic->coordinate];
-        }
-    }
+    double* answer(int j) { return answer_.data() + size * j; }
 
     const Tree* tree_;
-    std::shared_ptr<const SubtreeOrder> order_;
-    int size_;
-    Width width_;
-    std::vector<double> u_ = zeros(width_);
-    std::vector<double> row_ = zeros(width_, tree_->size()), answer_ = zeros(width_, tree_->size());  // row, and u / D
+    double u_[size] = {};
+    std::vector<double> row_ = zeros(size, tree_->size()), answer_ = row_;  // row, and u / D, which `solve` needs
     std::vector<double> pivot_ = zeros(tree_->dof());
-    detail::SubtreeSums matrix_, force_;
-    std::vector<double> motion_ = zeros(width_, tree_->size() + 1);  // of each body, after a zero for the base
+    SubtreeSums matrix_, force_;
+    std::vector<double> motion_ = zeros(size, tree_->size() + 1);  // of each body, after a zero for the base
 };
 
 // The factors of M + diag(armature) at consecutive configurations: the articulated body algorithm (Featherstone 2008).
 class ArticulatedBodies {
   public:
-    explicit ArticulatedBodies(const Tree& tree) : tree_(&tree), inertia_(tree.size()) {
-        const auto order = std::make_shared<const SubtreeOrder>(tree);
-        if (order->mimics.slots > 0) {
-            mimic_.emplace(tree, order, 6);
-        } else {
-            free_.emplace(tree, order, 6);
-        }
-    }
+    explicit ArticulatedBodies(const Tree& tree) : tree_(&tree), inertia_(tree.size()), matrix_(tree) {}
 
     // Factor M at q, with potential energies in `jet`; false at a pivot that is not positive.
     bool at(const Mechanism& mechanism, const double* q, Jet<double>& jet) {
@@ -184,31 +143,23 @@ class ArticulatedBodies {
     // Set the axis and the inertia of body j alone.
     void set_body(int j, const Motion<double>& axis, const Inertia<double>& inertia) {
         inertia_[j] = inertia;
-        detail::write(axis, free_ ? free_->row(j) : mimic_->row(j));
+        detail::write(axis, matrix_.row(j));
     }
 
-    // Eliminate body j, from the last body to the first; false at a pivot that is not positive.
-    bool eliminate(int j) { return free_ ? eliminate_in(*free_, j) : eliminate_in(*mimic_, j); }
+    // Eliminate body j, from the last body to the first; false at a pivot that is not positive. Here and below, the
+    // attribute inlines all calls in the loop over bodies, which saves a tenth of a step.
+    [[gnu::flatten]] bool eliminate(int j) {
+        detail::write(inertia_[j] * detail::motion_at(matrix_.row(j)), matrix_.u());
+        return matrix_.eliminate(j, tree_->armature.data(), detail::OwnInertia<6>(inertia_[j]));
+    }
 
     // As SymmetricElimination's.
-    void solve(const double* b, double* x, double* share) {
-        return free_ ? free_->solve(b, x, share) : mimic_->solve(b, x, share);
-    }
+    void solve(const double* b, double* x, double* share) { matrix_.solve(b, x, share); }
 
   private:
     const Tree* tree_;
     std::vector<Inertia<double>> inertia_;
-    std::optional<SymmetricElimination<Known<6>>> free_;
-    std::optional<SymmetricElimination<int>> mimic_;  // for coordinates that move several bodies
-
-    // Here and in step_elimination.hpp, the attribute `flatten` inlines all calls in the loop over bodies, which saves
-    // a tenth of a step.
-    template <class Matrix>
-    [[gnu::flatten]] bool eliminate_in(Matrix& matrix, int j) {
-        detail::write(inertia_[j] * detail::motion_at(matrix.row(j)), matrix.u());
-        const auto inertia = [&](int) { return detail::InertiaRows(inertia_[j]); };
-        return matrix.eliminate(j, tree_->armature.data(), detail::OwnInertia{inertia, 1, nullptr, 6, 0.0, 0.0});
-    }
+    SymmetricElimination<6> matrix_;
 };
 
 }  // namespace varpin

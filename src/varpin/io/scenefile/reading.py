@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.errors import FileError, InputError, UnknownJoint, VarpinError
+from varpin.errors import FileError, InputError, VarpinError
 from varpin.model import Robot, looks_like_degrees
 from varpin.support.checks import finite, is_file
 
@@ -59,7 +59,7 @@ class Where:
 
     def of(self, error: VarpinError, given: Mapping[str, Any]) -> SceneFileError:
         """An error of the API about the keys ``given`` of this table: that of the key which the error is about."""
-        name = error.joint if isinstance(error, UnknownJoint) else getattr(error, "frame", "")
+        name = getattr(error, "name", "")
         for key, value in given.items() if name else ():
             if isinstance(value, Mapping) and name in value:
                 return self.at(key, name).error(str(error))

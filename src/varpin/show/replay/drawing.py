@@ -1,9 +1,9 @@
-"""Drawing of a script in meshcat: robots, marks, the view, and their animation."""
+"""Robots and their marks in meshcat: their places, the view, the drawing and its animation."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -13,7 +13,7 @@ from meshcat.animation import Animation, AnimationClip, AnimationTrack
 
 from varpin.arrays import Floats
 from varpin.model import Robot
-from varpin.show.replay.marks import Figure, Mark, Region, samples, translation
+from varpin.show.replay.marks import REGIONS, Figure, Mark, samples, translation
 from varpin.show.replay.picture import Picture, label
 from varpin.show.replay.shapes import Style, load_shape
 
@@ -36,38 +36,69 @@ class Actor:
     Attributes:
         robot: The robot.
         motions: Configurations at the keyframes (K, n) [rad or m], by "robot" and, if there is one, "ghost".
-        marks: What is drawn beside it.
+        annotate: Makes the marks beside it.
         effort: Torque of each joint of the tree as a share of its limit at the keyframes (K, b), in [0, 1]; None for
             the robot in its own colours.
     """
 
     robot: Robot
     motions: Mapping[str, Floats]
-    marks: tuple[Mark, ...] = ()
+    annotate: Callable[[Figure], Iterable[Mark]]
     effort: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class Script:
-    """The contents of a replay.
+class Stage:
+    """The contents of a replay, in their places.
 
     Attributes:
         times: Times of the keyframes (K,) [s of playback]. All tracks share them: each track loops on its own, and
             tracks of unequal length would drift apart.
         actors: The robots.
+        figures: What their marks know of each.
+        marks: The marks of each.
+        places: Position of the world of each (3,) [m].
+        points: Points around everything that is shown (P, 3) [m].
+        toward: Unit vector (3,) to the camera.
+        size: Size of the largest robot's motion [m].
         speed: Seconds of motion in a second of playback.
         error: The estimated error of the motions in words; empty where it is not known.
     """
 
     times: Floats
-    actors: tuple[Actor, ...]
-    speed: float = 1.0
-    error: str = ""
+    actors: Sequence[Actor]
+    figures: list[Figure]
+    marks: list[list[Mark]]
+    places: list[Floats]
+    points: Floats
+    toward: Floats
+    size: float
+    speed: float
+    error: str
 
-    @property
-    def marks(self) -> list[Mark]:
-        """The marks of all robots."""
-        return [mark for actor in self.actors for mark in actor.marks]
+    @classmethod
+    def of(cls, times: Floats, actors: Sequence[Actor], speed: float = 1.0, error: str = "") -> Stage:
+        """The robots side by side with their marks, as a camera sees them that shows all."""
+        pictures = {id(actor.robot): Picture.of(actor.robot) for actor in actors}
+        swept, axes, size = [], [], 0.0
+        for actor in actors:
+            picture = pictures[id(actor.robot)]
+            q = np.concatenate([*map(samples, actor.motions.values())])
+            swept.append(picture.swept(q))
+            size = max(size, float(np.ptp(swept[-1], axis=0).max()))
+            axes.append(picture.body_poses(q)[0][..., 2].reshape(-1, 3))
+        size = size or 1.0
+        toward = view_direction(np.concatenate(axes))
+        plane = across(toward), np.cross(toward, across(toward))
+        figures = [
+            Figure(pictures[id(actor.robot)], actor.motions["robot"], size, plane, points)
+            for actor, points in zip(actors, swept, strict=True)
+        ]
+        marks = [list(actor.annotate(figure)) for actor, figure in zip(actors, figures, strict=True)]
+        extents = [_extent(figure, own) for figure, own in zip(figures, marks, strict=True)]
+        places = side_by_side(extents, toward)
+        points = np.concatenate([points + place for points, place in zip(extents, places, strict=True)])
+        return cls(times, actors, figures, marks, places, points, toward, size, speed, error)
 
     @property
     def title(self) -> str:
@@ -75,26 +106,17 @@ class Script:
         return ", ".join(dict.fromkeys(actor.robot.name for actor in self.actors))
 
 
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """The contents for which the view was set.
-
-    Attributes:
-        size: Size of the largest robot's motion [m].
-        points: Points around everything that is shown (P, 3) [m].
-        toward: Unit vector (3,) to the camera.
-        figures: Each robot.
-    """
-
-    size: float
-    points: Floats
-    toward: Floats
-    figures: list[Figure]
+def _extent(figure: Figure, marks: Sequence[Mark]) -> Floats:
+    """Points (P, 3) around a robot and its marks [m]; regions much larger than the rest are shown in part."""
+    points = np.concatenate([figure.swept, *(mark.around for mark in marks if mark.kind not in REGIONS)])
+    low, high, margin = points.min(axis=0), points.max(axis=0), _AROUND * figure.size
+    regions = [mark.around for mark in marks if mark.kind in REGIONS]
+    return np.concatenate([points, *(np.clip(region, low - margin, high + margin) for region in regions)])
 
 
-def draw(viewer: meshcat.Visualizer, script: Script) -> Stage:
-    """Send a script to a viewer."""
-    return _Drawing(viewer, script).draw()
+def draw(viewer: meshcat.Visualizer, stage: Stage) -> None:
+    """Send everything to a viewer."""
+    _Drawing(viewer, stage).draw()
 
 
 def tree_positions(robot: Robot, q: Floats) -> Floats:
@@ -104,56 +126,24 @@ def tree_positions(robot: Robot, q: Floats) -> Floats:
 
 
 class _Drawing:
-    """The drawing of one script in one viewer."""
+    """The drawing of a stage in one viewer."""
 
-    def __init__(self, viewer: meshcat.Visualizer, script: Script) -> None:
+    def __init__(self, viewer: meshcat.Visualizer, stage: Stage) -> None:
         self.viewer = viewer
-        self.script = script
+        self.stage = stage
         self.clips: dict[meshcat.path.Path, AnimationClip] = {}
-        robots = {id(actor.robot): actor.robot for actor in script.actors}
-        self.pictures = {key: Picture.of(robot) for key, robot in robots.items()}
 
-    def draw(self) -> Stage:
-        stage, places = self._stage()
-        for k, (actor, figure, place) in enumerate(zip(self.script.actors, stage.figures, places, strict=True)):
+    def draw(self) -> None:
+        stage = self.stage
+        set_view(self.viewer, stage.points, stage.toward, stage.size)
+        for k, (actor, figure, place) in enumerate(zip(stage.actors, stage.figures, stage.places, strict=True)):
             number = f" {k + 1}" if k else ""
             self._robot(actor, figure.picture, number, place)
             self.viewer[f"notes{number}"].set_transform(translation(place))
-            for i, mark in enumerate(actor.marks):
+            for i, mark in enumerate(stage.marks[k]):
                 self._mark(mark, mark_name(i, mark), figure, number)
-        if len(self.script.times) > 1:
+        if len(stage.times) > 1:
             self.viewer.set_animation(Animation(self.clips), play=True, repetitions=math.inf)
-        return stage
-
-    def _stage(self) -> tuple[Stage, list[Floats]]:
-        """Set the view; the stage, and the position of each robot's world (3,) [m]."""
-        pictures = [self.pictures[id(actor.robot)] for actor in self.script.actors]
-        swept, axes, size = [], [], 0.0
-        for actor, picture in zip(self.script.actors, pictures, strict=True):
-            q = np.concatenate([*map(samples, actor.motions.values())])
-            swept.append(picture.swept(q))
-            size = max(size, float(np.ptp(swept[-1], axis=0).max()))
-            axes.append(picture.body_poses(q)[0][..., 2].reshape(-1, 3))
-        size = size or 1.0
-        toward = view_direction(np.concatenate(axes))
-        plane = across(toward), np.cross(toward, across(toward))
-        figures = [
-            Figure(picture, actor.motions["robot"], size, plane, points)
-            for actor, picture, points in zip(self.script.actors, pictures, swept, strict=True)
-        ]
-        extents = [self._extent(actor, figure) for actor, figure in zip(self.script.actors, figures, strict=True)]
-        places = side_by_side(extents, toward)
-        points = np.concatenate([points + place for points, place in zip(extents, places, strict=True)])
-        set_view(self.viewer, points, toward, size)
-        return Stage(size, points, toward, figures), places
-
-    def _extent(self, actor: Actor, figure: Figure) -> Floats:
-        """Points (P, 3) around a robot and its marks [m]; regions much larger than the rest are shown in part."""
-        seen = [mark.around(figure) for mark in actor.marks if not isinstance(mark, Region)]
-        points = np.concatenate([figure.swept, *seen])
-        low, high, margin = points.min(axis=0), points.max(axis=0), _AROUND * figure.size
-        regions = [mark.around(figure) for mark in actor.marks if isinstance(mark, Region)]
-        return np.concatenate([points, *(np.clip(region, low - margin, high + margin) for region in regions)])
 
     def _robot(self, actor: Actor, picture: Picture, number: str, place: Floats) -> None:
         tree = actor.robot.tree
@@ -185,7 +175,7 @@ class _Drawing:
         self._animate(node, "material.color", "color", colors)
 
     def _mark(self, mark: Mark, name: str, figure: Figure, number: str) -> None:
-        for item in mark.items(figure):
+        for item in mark.items:
             node = mark_node(figure.picture, name, item.node, item.body, number)
             if item.form is not None:
                 self.viewer[node].set_object(item.form)
@@ -199,7 +189,7 @@ class _Drawing:
         path = self.viewer[node].path
         # With fps = 1, keyframe times are seconds.
         clip = self.clips.setdefault(path, AnimationClip({}, fps=1))
-        clip.tracks[name] = AnimationTrack(name, kind, self.script.times.tolist(), values.tolist())
+        clip.tracks[name] = AnimationTrack(name, kind, self.stage.times.tolist(), values.tolist())
 
 
 def mark_name(index: int, mark: Mark) -> str:

@@ -26,10 +26,21 @@ from varpin.marks import Marks
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot
 from varpin.show.given import frame_names
-from varpin.show.replay import forms
-from varpin.show.replay.annotations import references, require_marks, rows_at, surroundings
-from varpin.show.replay.drawing import Actor, Script, draw, joint_motion, mark_name, mark_node, set_view, tree_positions
-from varpin.show.replay.marks import KINDS, LABEL, TUBE, Tie, translation
+from varpin.show.replay import shapes
+from varpin.show.replay.drawing import Actor, Stage, draw, joint_motion, mark_name, mark_node, set_view, tree_positions
+from varpin.show.replay.marks import (
+    KINDS,
+    LABEL,
+    TUBE,
+    Figure,
+    Mark,
+    references,
+    require_marks,
+    rows_at,
+    surroundings,
+    ties,
+    translation,
+)
 from varpin.show.replay.page import open_browser
 from varpin.show.replay.picture import label
 from varpin.support.checks import flag, positive
@@ -112,7 +123,13 @@ class LiveView:
         start = np.clip(np.zeros(robot.dof), lower, upper)
         self._q = np.asarray(getattr(source, "q0", start), dtype=np.float64)
         self._path: dict[str, list[Floats]] = {name: [] for name in frame_names("trace", [robot], marks.trace)[0]}
-        actor = self._actor(source, marks)
+        (frames,) = frame_names("frames", [robot], marks.frames)
+
+        def annotate(figure: Figure) -> Iterator[Mark]:
+            yield from references(figure, marks.reference)
+            yield from surroundings(figure, marks, frames, source, np.zeros(1), 0.0)
+
+        self._stage = Stage.of(np.zeros(1), [Actor(robot, {"robot": self._q[None]}, annotate)])
         open = flag("open", open)
         self._text, self._text_time = "", -math.inf
         self._closed = False
@@ -120,20 +137,12 @@ class LiveView:
         self._window = _Window()
         self.url: str = self._window.web_url
         self._viewer = meshcat.Visualizer(window=self._window)
-        self._stage = draw(self._viewer, Script(np.zeros(1), (actor,)))
-        (self._figure,) = self._stage.figures
-        self._nodes = self._figure.picture.moving_nodes("robot")
-        self._ties = {mark_name(k, tie): tie for k, tie in enumerate(actor.marks) if isinstance(tie, Tie)}
+        draw(self._viewer, self._stage)
+        self._nodes = self._stage.figures[0].picture.moving_nodes("robot")
         self._in_view = self._stage.points
         self._begin_run()
         if open and open_browser(self.url):
             self.wait()
-
-    def _actor(self, source: object, marks: Marks) -> Actor:
-        """The robot at its start, with its marks."""
-        robot, frames = self.robot, frame_names("frames", [self.robot], marks.frames)[0]
-        around = surroundings(robot, marks, frames, source, np.zeros(1), 0.0)
-        return Actor(robot, {"robot": self._q[None]}, (*references(marks.reference), *around))
 
     def __enter__(self) -> Self:
         return self
@@ -257,10 +266,11 @@ class LiveView:
             if positions[j] != before[j] or self._shown == -math.inf:
                 self._viewer[node].set_transform(joint_motion(bool(tree.prismatic[j]), positions[j]))
         self._q = row[0]
-        figure = replace(self._figure, q=row)
-        for name, tie in self._ties.items():
-            for rod in tie.rod(figure):
-                self._viewer[mark_node(figure.picture, name, rod.node)].set_transform(rod.pose)
+        figure = replace(self._stage.figures[0], q=row)
+        for k, mark in enumerate(self._stage.marks[0]):
+            for item in [] if mark.tied is None else next(ties(figure, mark.tied)).items:
+                if item.node == "rod":
+                    self._viewer[mark_node(figure.picture, mark_name(k, mark), "rod")].set_transform(item.pose)
         self._keep_in_view(figure.poses[1][0])
 
     def _keep_in_view(self, points: Floats) -> None:
@@ -283,7 +293,7 @@ class LiveView:
                     path.append(point)
             del path[:-_TRACE]
             if len(path) > 1:
-                tube = forms.tube(np.array(path), TUBE * size, KINDS["motion"][1])
+                tube = shapes.tube(np.array(path), TUBE * size, KINDS["motion"][1])
                 self._viewer[f"notes/live/{label(name)}"].set_object(tube)
 
     def _set_caption(self, words: str, *, last: bool = False) -> None:
@@ -293,7 +303,7 @@ class LiveView:
             return
         low, high = self._in_view.min(axis=0), self._in_view.max(axis=0)
         self._viewer["notes/words"].set_transform(translation(np.array([*(0.5 * (low + high))[:2], low[2]])))
-        self._viewer["notes/words"].set_object(forms.Label(words, LABEL * self._stage.size, 0.0))
+        self._viewer["notes/words"].set_object(shapes.Label(words, LABEL * self._stage.size, 0.0))
         self._text, self._text_time = words, now
 
 

@@ -1,4 +1,4 @@
-"""A script in meshcat: as one HTML file that needs no server, or in a live browser window."""
+"""A stage in meshcat: as one HTML file that needs no server, or in a live browser window."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ import umsgpack
 
 from varpin.errors import InputError
 from varpin.io.archive import atomic_file
-from varpin.show.replay.drawing import EFFORT_COLORS, Script, draw
-from varpin.show.replay.marks import GHOST_COLOR, legend
+from varpin.show.replay.drawing import EFFORT_COLORS, Stage, draw
+from varpin.show.replay.marks import legend
+from varpin.show.replay.shapes import GHOST_COLOR
 
 logger = logging.getLogger(__name__)
 
@@ -43,12 +44,12 @@ class Page:
         except OverflowError:
             raise InputError("the replay has sizes or positions beyond 3e38, which no viewer draws") from None
 
-    def html(self, script: Script) -> str:
+    def html(self, stage: Stage) -> str:
         """The page: meshcat's viewer, the compressed commands, the legend and the control bar."""
         viewer = Path(meshcat.viewer_assets_path(), "dist", "main.min.js").read_text(encoding="utf-8")
         stream = b"".join(len(command).to_bytes(4, "little") + command for command in self.commands)
         packed = base64.b64encode(gzip.compress(stream, 6, mtime=0)).decode()
-        title, key = markup.escape(script.title), "\n".join(_legend(script))
+        title, key = markup.escape(stage.title), "\n".join(_legend(stage))
         return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -60,7 +61,7 @@ class Page:
 <body>
 <div id="stage"><div id="meshcat-pane"></div><p id="loading">loading</p>
 <div id="about"><h1>{title}</h1><ul>{key}</ul></div></div>
-{_bar(script)}
+{_bar(stage)}
 <script>{viewer}</script>
 <script id="commands" type="text/plain">{packed}</script>
 <script>{_part("player.js")}</script>
@@ -73,34 +74,35 @@ def _part(name: str) -> str:
     return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
-def _legend(script: Script) -> Iterator[str]:
+def _legend(stage: Stage) -> Iterator[str]:
     """The lines of the legend, one for each kind of mark, and the error of the motion."""
+    marks = [mark for own in stage.marks for mark in own]
     lines: list[tuple[str, list[int]]] = []
-    if any(actor.effort is not None for actor in script.actors):
+    if any(actor.effort is not None for actor in stage.actors):
         scale = [int.from_bytes(np.rint(255.0 * color).astype(np.uint8).tobytes()) for color in EFFORT_COLORS]
         lines.append(("torque: none, half, all of the limit", scale))
-    if any("ghost" in actor.motions for actor in script.actors):
-        planned = any(mark.kind == "plan" for mark in script.marks)
+    if any("ghost" in actor.motions for actor in stage.actors):
+        planned = any(mark.kind == "plan" for mark in marks)
         lines.append(("plan" if planned else "ghost", [GHOST_COLOR]))
-    lines += [(text, [color]) for text, color in legend(script.marks)]
+    lines += [(text, [color]) for text, color in legend(marks)]
     for text, colors in lines:
         ramp = ", ".join(f"#{color:06x}" for color in (colors if len(colors) > 1 else colors * 2))
         swatch = f'<span class="swatch" style="background: linear-gradient(to right, {ramp})"></span>'
         yield f"<li>{swatch}{markup.escape(text)}</li>"
-    if script.error:
-        yield f"<li>{markup.escape(script.error)}</li>"
+    if stage.error:
+        yield f"<li>{markup.escape(stage.error)}</li>"
 
 
-def _bar(script: Script) -> str:
+def _bar(stage: Stage) -> str:
     """The control bar with play, time and speed; empty for a pose."""
-    if len(script.times) < 2:
+    if len(stage.times) < 2:
         return ""
     options = "".join(
-        f'<option value="{speed:g}"{" selected" if speed == script.speed else ""}>{speed:g} x</option>'
-        for speed in sorted({*_SPEEDS, script.speed})
+        f'<option value="{speed:g}"{" selected" if speed == stage.speed else ""}>{speed:g} x</option>'
+        for speed in sorted({*_SPEEDS, stage.speed})
     )
     return (
-        f'<div id="bar" data-speed="{script.speed!r}"><button id="play" type="button"></button>'
+        f'<div id="bar" data-speed="{stage.speed!r}"><button id="play" type="button"></button>'
         '<input id="time" type="range" min="0" step="any" value="0" aria-label="Time">'
         f'<output id="clock"></output><select id="speed" title="Speed" aria-label="Speed">{options}</select></div>'
     )
@@ -132,29 +134,29 @@ class Inline:
         )
 
 
-def write_page(path: Path, script: Script) -> Path:
-    """Write a script as one self-contained HTML file."""
+def write_page(path: Path, stage: Stage) -> Path:
+    """Write a stage as one self-contained HTML file."""
     with atomic_file(path) as stream:
-        stream.write(_page(script).encode())
+        stream.write(_page(stage).encode())
     return path
 
 
-def inline_page(script: Script, size: tuple[int, int]) -> Inline:
-    """A script's page for a notebook, with a width and a height [pixels]."""
-    return Inline(_page(script), script.title, size)
+def inline_page(stage: Stage, size: tuple[int, int]) -> Inline:
+    """A stage's page for a notebook, with a width and a height [pixels]."""
+    return Inline(_page(stage), stage.title, size)
 
 
-def _page(script: Script) -> str:
+def _page(stage: Stage) -> str:
     page = Page()
-    draw(meshcat.Visualizer(window=page), script)
-    return page.html(script)
+    draw(meshcat.Visualizer(window=page), stage)
+    return page.html(stage)
 
 
-def open_viewer(script: Script) -> meshcat.Visualizer:
-    """Draw a script in a new meshcat server, and open it in a web browser."""
+def open_viewer(stage: Stage) -> meshcat.Visualizer:
+    """Draw a stage in a new meshcat server, and open it in a web browser."""
     with contextlib.redirect_stdout(io.StringIO()):
         viewer = meshcat.Visualizer()
-    draw(viewer, script)
+    draw(viewer, stage)
     open_browser(viewer.url())
     return viewer
 

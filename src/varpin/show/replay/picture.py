@@ -16,7 +16,6 @@ from varpin.model import Robot, readable_geometry
 from varpin.model.kinematics import links
 from varpin.model.meshes import MeshPart, parts_of, read_mesh
 from varpin.model.tree import joint_axis, z_to
-from varpin.show.replay.marks import corners_of
 
 logger = logging.getLogger(__name__)
 
@@ -99,6 +98,11 @@ class Picture:
         for j in range(R.shape[1]):
             points.append((self.corners(j) @ R[:, j].transpose(0, 2, 1) + p[:, j, None]).reshape(-1, 3))
         return np.concatenate(points)
+
+
+def corners_of(box: Floats) -> Floats:
+    """The corners (8, 3) of a box (2, 3)."""
+    return np.stack(np.meshgrid(*box.T), axis=-1).reshape(8, 3)
 
 
 def _turns(robot: Robot) -> list[pin.SE3]:
