@@ -61,8 +61,8 @@ _NOTHING = 1e-9
 # Weight of the rows in the merit: this many times the largest multiplier, and at most _HEAVY times, as heavy rows
 # shorten steps; where rows cannot all be met, this many times what the cost is per violation. From 3 to 100.
 _ABOVE, _HEAVY = 1.5, 10.0
-# Slack of rows that are met, relative to the violations; from 1e-8 to 1e-4.
-_MET = 1e-6
+# Slack of rows that are met, and of rows that a step approaches, relative to the violations; the latter from 0.5 on.
+_MET, _APPROACHED = 1e-6, 0.9
 # Decrease, as a share of the cost at stake, from which on motions are looked at between nodes; from 1e-4 to 1e-2.
 _CLOSE = 1e-3
 # Greatest number of halvings of a trial's steps beyond those that the present motion needs; from 2 to 6.
@@ -344,7 +344,7 @@ class Search:
         elastic = bool(rows) and needed > dear
         if elastic:
             missed = program.minimum(values, weight=dear)
-            elastic = missed is not None
+            elastic = missed is not None and (found is None or missed.slack <= _APPROACHED * bad)
             found, self.weight = (missed, dear) if elastic else (found, self.weight)
         self.unsolved = found is None
         if found is None:
