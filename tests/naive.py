@@ -112,11 +112,6 @@ def directional(g, x: np.ndarray, directions: np.ndarray) -> np.ndarray:
     return total / STEP
 
 
-def hessian(f, x: np.ndarray) -> np.ndarray:
-    """Second derivatives (k, k) of f at real x (k,)."""
-    return directional(lambda y: gradient(f, y), x, np.eye(x.size))
-
-
 def continuous(scene: vp.Scene, q, v, controls, dt, running, law=None, method="DOP853", rtol=1e-11):
     """The continuous motion under controls held over dt, by a method of SciPy on Pinocchio's own dynamics.
 

@@ -140,6 +140,21 @@ def cost_terms(links, n, m):
     return costs
 
 
+def of_backward(n, m, k=2):
+    """Arguments of a pass over N steps, with what it writes."""
+    x, R = 2 * n, N // 2
+    given = {"A": draw(N, x, x), "B": draw(N, x, m), "G": draw(N, x, k), "Gx": draw(N, x, k, x), "Gu": draw(N, x, k, m)}
+    given |= {"gradient": draw(N, x + m), "hessian": np.tile(np.eye(x + m), (N, 1, 1)), "end": draw(x)}
+    written = {"feedforward": (R, m), "feedback": (R, m, x), "control_gradient": (R, m)}
+    written |= {"spread": (N, x, x), "factors": (R, m, m)}
+    return given | {name: np.empty(shape) for name, shape in written.items()}
+
+
+def backward(end, **arrays):
+    run = core.BackwardPass(arrays["B"].shape[2], end, np.eye(end.size))
+    assert run.run(1e-3, 2, 0.0, **arrays) == -1
+
+
 def calls():
     """By name, what is called and arguments that fit."""
     own = scene()
@@ -182,6 +197,7 @@ def calls():
     yield "links", core.Links.make, links
     frame = {"turned": np.eye(3), "shifted": draw(3), "q": draw(N, n), "jacobian": True}
     yield "place a frame", made.place_frame, frame
+    yield "backward pass", backward, of_backward(n, m)
     costs = cost_terms(made, n, m)
     for name, call in (("cost values", costs.values), ("cost expansions", costs.expand)):
         yield name, call, {**states, "u": draw(N, m)}

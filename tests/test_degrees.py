@@ -119,7 +119,7 @@ def test_stops_in_degrees(caplog):
     assert not caplog.records
     vp.Scene(robot, forces=[vp.JointStop(1e3, 5.0, lower=-90.0, upper=90.0)])
     told = [record.getMessage() for record in caplog.records]
-    assert [sentence.partition(" of the JointStop")[0] for sentence in told] == ["the lower end", "the upper end"]
+    assert [sentence.partition(" of the JointStop")[0] for sentence in told] == ["lower", "upper"]
     assert all("looks like degrees" in sentence for sentence in told)
 
 

@@ -67,15 +67,6 @@ class TestEveryRobot:
         kinetic = 0.5 * v @ reference.Lvv @ v
         assert abs(compiled.L - reference.L) <= 1e-12 * (kinetic + abs(kinetic - reference.L))
 
-    def test_is_the_derivative_of_a_plain_lagrangian(self, robot):
-        """Of Pinocchio's, which the compiled jet is by the test above."""
-        rng = np.random.default_rng(11)
-        n = robot.dof
-        scene = busy_scene(robot, rng)
-        q, v = rng.uniform(-3.0, 3.0, n), rng.normal(0.0, 2.0, n)
-        directions = np.eye(n) if n <= 9 else rng.normal(size=(2, n)) / np.sqrt(n)
-        check_against_naive(scene, q, v, directions, "pinocchio")
-
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10**6), bodies=st.integers(1, 9), branching=st.booleans())

@@ -8,7 +8,7 @@ import pytest
 from findings import about
 from mechanisms import slider
 from naive import continuous, directional
-from plan_problems import reach
+from plan_problems import SMALL, reach
 from refusals import refused, unnamed
 
 import varpin as vp
@@ -102,6 +102,14 @@ def test_accuracy_is_honest():
         assert found.substeps == most
         assert abs(found.open_loop_cost / true - 1.0) <= found.accuracy
     assert found.accuracy < 1e-8
+
+
+@pytest.mark.parametrize("name", ["linear, change of controls", "held, change of controls"])
+def test_changes_of_controls_cost_the_same_in_finer_steps(name):
+    """Those of the decisions, the first one from the control before included."""
+    found = SMALL[name].plan.verify(tolerance=1e-6)
+    assert abs(found.open_loop_loss) < 1e-3
+    assert abs(found.closed_loop_loss) < 1e-3
 
 
 def test_motion_that_runs_away():

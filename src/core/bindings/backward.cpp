@@ -2,7 +2,7 @@
 #include "varpin/backward.hpp"
 
 #include "arrays.hpp"
-#include "registrations.hpp"
+#include "units.hpp"
 #include "varpin/square_root.hpp"
 #include "varpin/steps.hpp"
 

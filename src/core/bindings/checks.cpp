@@ -2,7 +2,7 @@
 #include <utility>
 
 #include "arrays.hpp"
-#include "registrations.hpp"
+#include "units.hpp"
 #include "varpin/clearance.hpp"
 
 namespace varpin::border {

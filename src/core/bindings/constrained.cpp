@@ -4,7 +4,6 @@
 #include <tuple>
 #include <vector>
 
-#include "registrations.hpp"
 #include "steps_at.hpp"
 #include "units.hpp"
 #include "varpin/constrained_linearization.hpp"

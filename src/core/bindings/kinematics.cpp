@@ -8,7 +8,7 @@
 
 #include "arrays.hpp"
 #include "bodies.hpp"
-#include "registrations.hpp"
+#include "units.hpp"
 
 namespace varpin::border {
 

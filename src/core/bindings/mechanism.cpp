@@ -18,7 +18,6 @@
 
 #include "arrays.hpp"
 #include "bodies.hpp"
-#include "registrations.hpp"
 #include "units.hpp"
 #include "varpin/dense.hpp"
 #include "varpin/jet.hpp"

@@ -1,5 +1,5 @@
 // The Python module of the core.
-#include "registrations.hpp"
+#include "units.hpp"
 
 NB_MODULE(_core, m) {
     m.doc() = "The compiled core.";

@@ -13,7 +13,6 @@
 #include <vector>
 
 #include "arrays.hpp"
-#include "registrations.hpp"
 #include "rollout_arrays.hpp"
 #include "steps_at.hpp"
 #include "units.hpp"

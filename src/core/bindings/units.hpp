@@ -1,6 +1,8 @@
 // What the units of bindings give each other. docs/core.md, "The map".
 #pragma once
 
+#include <nanobind/nanobind.h>
+
 #include <memory>
 #include <vector>
 
@@ -20,6 +22,16 @@ const Kernels& kernels_of(const Mechanism& mechanism);
 std::unique_ptr<VariationalStepper> constrained_stepper(const Mechanism& mechanism, const Tableau& tableau,
                                                         const std::vector<double>& places, double tolerance,
                                                         const Guards& guards);
+
+// Of each unit.
+void register_mechanism(nanobind::module_& m);
+void register_kinematics(nanobind::module_& m);
+void register_explicit(nanobind::module_& m);
+void register_backward(nanobind::module_& m);
+void register_rollouts(nanobind::module_& m);
+void register_constrained(nanobind::module_& m);
+void register_checks(nanobind::module_& m);
+void register_costs(nanobind::module_& m);
 
 }  // namespace border
 

@@ -14,10 +14,6 @@ from varpin.arrays import Floats
 from varpin.control.constraints import (
     KeepClear,
     KeepInBox,
-    KeepInHalfSpace,
-    KeepInSphere,
-    KeepOutOfSphere,
-    PlanConstraint,
     ReachFrame,
     WithinJointLimits,
 )
@@ -207,7 +203,7 @@ def _outside(problem: OptimalControlProblem) -> Iterator[Finding]:
 def _weights(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Limits of joint torques that cannot hold the arm at rest where it starts, or where it is to end."""
     scene, names = problem.scene, problem.scene.robot.joint_names
-    if not problem.limited or scene.constraints or not (scene.direct and scene.direct_efforts):
+    if not problem.limited or scene.constraints or not scene.direct or scene.servo_joints or scene.inputs:
         return
     postures: list[tuple[str, Floats]] = [] if problem.v0.any() else [("the start", problem.q0)]
     postures += [("the goal of the terminal TrackingCost", end) for end in _postures(problem)]
@@ -252,27 +248,20 @@ def _in_millimetres(problem: OptimalControlProblem) -> Iterator[Finding]:
             yield Finding("places in millimetres", sentence)
 
 
-def _lengths(constraint: PlanConstraint) -> dict[str, float]:
+def _lengths(constraint: Any) -> dict[str, float]:
     """Names of a constraint's lengths, and their sizes [m]; places count by their distance from the robot's root."""
-    found: dict[str, float] = {}
-    if isinstance(constraint, KeepClear):
-        root = constraint.robot.tree.translation[0]
-        for body in constraint.obstacles:
-            away, sides = np.linalg.norm([body.begin - root, body.end - root], axis=1), body.sides
-            sides = sides if body.hull is None else body.hull.sides
-            found[f"the obstacle {body.name!r}: its distance"] = float(away.min())
-            found[f"the obstacle {body.name!r}: its radius or side"] = body.radius if sides is None else sides.max()
-    elif isinstance(constraint, KeepInSphere | KeepOutOfSphere):
-        found["radius"] = constraint.radius
-        if not callable(constraint.center):
-            root = constraint.robot.tree.translation[0]
-            found["the distance of its centre"] = float(np.linalg.norm(constraint.center - root))
-    elif isinstance(constraint, KeepInHalfSpace):
-        found["offset"] = abs(constraint.offset)
-    elif isinstance(constraint, KeepInBox):
+    found = {name: abs(getattr(constraint, name)) for name in ("radius", "offset") if hasattr(constraint, name)}
+    if isinstance(center := getattr(constraint, "center", None), np.ndarray):
+        found["the distance of its centre"] = float(np.linalg.norm(center - constraint.robot.tree.translation[0]))
+    if isinstance(constraint, KeepInBox):
         # One far side may stand for none.
         sides = np.abs(constraint.limits[np.isfinite(constraint.limits)])
-        found["its nearest side"] = float(np.min(sides, initial=np.inf, where=sides > 0.0)) if sides.any() else 0.0
+        found["its nearest side"] = float(sides[sides > 0.0].min(initial=np.inf)) if sides.any() else 0.0
+    for body in getattr(constraint, "obstacles", ()):
+        ends, sides = np.array([body.begin, body.end]), body.sides if body.hull is None else body.hull.sides
+        away = np.linalg.norm(ends - constraint.robot.tree.translation[0], axis=1)
+        found[f"the obstacle {body.name!r}: its distance"] = float(away.min())
+        found[f"the obstacle {body.name!r}: its radius or side"] = body.radius if sides is None else sides.max()
     return found
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -95,7 +95,7 @@ def _pass(steps: Steps, given: Recursion, regularization: float, *, second: bool
         "hessian": given.hessian,
     }
     found_arrays = {"feedforward": feedforward, "feedback": gains, "control_gradient": by_controls}
-    arrays = {**given_arrays, **found_arrays, "spread": spread, "factors": factors}
+    arrays: dict[str, Any] = {**given_arrays, **found_arrays, "spread": spread, "factors": factors}
     found: core.BackwardPass | core.RootPass
     if roots:
         final, running = squares_of(end.cost.gradient, end.cost.hessian), squares_of(given.gradient, given.hessian)

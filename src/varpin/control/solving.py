@@ -1,4 +1,4 @@
-"""The function ``solve``: options, the first motion, resumed plans and refinement of the step."""
+"""The function ``solve``: options, first motions, also along given states, resumed plans and refinement."""
 
 from __future__ import annotations
 
@@ -11,23 +11,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from varpin import core
+from varpin.arrays import Floats
 from varpin.control.checks import foreseen, looked_at
 from varpin.control.history import ITERATIONS, Iteration, Status
-from varpin.control.problem import OptimalControlProblem, require_problem
+from varpin.control.multipliers import FEASIBLE
+from varpin.control.problem import FASTEST, OptimalControlProblem, require_problem
 from varpin.control.refine import SUFFICIENT, refine
-from varpin.control.rollout import controls_along, first_commands
+from varpin.control.rollout import around, controls_along, first_commands
 from varpin.control.search import Report, Search
 from varpin.control.solution import Solution
-from varpin.control.starts import Path, commands_along, path_of
-from varpin.errors import InputError
+from varpin.core.arrays import Commands
+from varpin.errors import InputError, VarpinError
 from varpin.finding import announce
+from varpin.linearization import node_jets
+from varpin.model import degrees_hint
+from varpin.signals.commands import as_moved, with_ends
 from varpin.signals.policy import LinearPolicy
-from varpin.support.checks import JointValues, count, flag, positive, real, told_motion
+from varpin.simulation.record import rollout
+from varpin.support.checks import JointValues, count, finite_array, flag, positive, real, told_motion
 from varpin.support.one_thread import one_thread
 from varpin.trajectory import Trajectory
 
 Callback = Callable[[Iteration], None] | Callable[[Iteration, Trajectory], None]
 Progress = Callable[[int, int], None]
+# States at a problem's nodes: q (N + 1, n) [rad or m] and v (N + 1, n) [rad/s or m/s].
+_Path = tuple[Floats, Floats]
 
 logger = logging.getLogger(__name__)
 
@@ -130,7 +139,7 @@ def solve(
             if given is not None:
                 raise InputError(f"resume goes on with the solution's own search: leave out either {name} or resume")
         _require_resumable(problem, resume)
-    path = None if states is None else path_of(problem, states)
+    path = None if states is None else _path_of(problem, states)
     if check:
         # The search may take long where values are in wrong units.
         announce(logger, problem.scene.announced, problem.dt, foreseen(problem))
@@ -139,14 +148,14 @@ def solve(
         problem: OptimalControlProblem,
         controls: JointValues | LinearPolicy | Solution | None,
         resume: Solution | None = None,
-        path: Path | None = None,
+        path: _Path | None = None,
         tolerance: float = tolerance,
     ) -> Solution:
         search = Search(problem, second_order=second_order, regularization=regularization)
         if resume is not None:
             search.resume(resume)
         elif path is not None:
-            search.begin(commands_along(problem, path, controls_along(problem, controls)))
+            search.begin(_commands_along(problem, path, controls_along(problem, controls)))
         else:
             search.begin(first_commands(problem, controls))
         known = len(search.history)
@@ -195,3 +204,79 @@ def _require_resumable(problem: OptimalControlProblem, resume: Solution) -> None
         raise InputError("resume: the solution does not hold the state of its search; give it as controls")
     if other := problem.mismatch(resume.problem.setting, resume.trajectory, resume.cost):
         raise InputError(f"resume: the solution is {other}; give it as controls")
+
+
+def _path_of(problem: OptimalControlProblem, given: Any) -> _Path:
+    """The states that a search starts from, checked."""
+    robot, shape = problem.scene.robot, (problem.steps + 1, problem.scene.robot.dof)
+    names = robot.joint_names
+    if isinstance(given, Trajectory):
+        if given.joint_names != names:
+            raise InputError(f"states: the motion is of joints {given.joint_names}, the problem of {names}")
+        if given.steps == problem.steps and not np.isclose(given.dt, problem.dt, rtol=1e-6):
+            raise InputError(
+                f"states: the motion has dt = {given.dt:g} s, the problem {problem.dt:g} s: give its q alone"
+            )
+        given = given.q, given.v
+    q, v = given if isinstance(given, tuple) and len(given) == 2 else (given, None)
+    positions = finite_array("states", q, shape).copy()
+    units = degrees_hint(robot, "states: the position", positions[int(np.abs(positions).max(axis=1).argmax())])
+    off = np.abs(positions[0] - problem.q0)
+    joint = int(off.argmax())
+    if off[joint] > FEASIBLE:
+        raise InputError(
+            f"states must begin at the problem's q0: joint {names[joint]!r} is at {positions[0, joint]:.6g} in their "
+            f"first row, and at {problem.q0[joint]:.6g} in q0{'; ' if units else ''}{units}"
+        )
+    if units:
+        logger.warning("%s", units)
+    speeds = np.gradient(positions, problem.dt, axis=0) if v is None else finite_array("states: v", v, shape).copy()
+    speeds[0] = problem.v0
+    return positions, speeds
+
+
+def _commands_along(problem: OptimalControlProblem, path: _Path, controls: Floats | None) -> Commands:
+    """Commands whose motion keeps to states, under ``controls`` (R, m) or, by default, those of inverse dynamics."""
+    scene, hold, (q, v), u = problem.scene, problem.hold, path, controls
+    m = scene.controls
+    if u is None:
+        torques = _joint_forces(problem, q, v) @ np.linalg.pinv(scene.actuation).T
+        u = as_moved(scene, q[hold::hold], v[hold::hold], torques)
+        u = np.clip(u, *problem.control_limits)
+    q, v = q[:-1:hold], v[:-1:hold]
+    if problem.integrator.variational:
+        v = (node_jets(scene, q, v)[0] @ v[:, :, None])[:, :, 0]
+    x, gains = np.hstack([q, v]), problem.feedback(FASTEST / problem.period)
+    if not problem.linear:
+        return around(problem, u, x, np.tile(gains, (len(u), 1, 1)), None)
+    if controls is None:
+        # Lines through the means of neighbours.
+        held, u = u, np.vstack([u[:1], 0.5 * (u[:-1] + u[1:]), u[-1:]])
+        u[1:] = with_ends(scene, u[1:], held)
+    u = problem.begun(u)
+    # A line answers a state half a step later than a held control, so that feedback may do harm.
+    tries = [
+        around(problem, u, x, np.tile(own, (len(u), 1, 1)), np.zeros((len(u), m, m))) for own in (gains, 0 * gains)
+    ]
+    return min(tries, key=lambda commands: _cost_under(problem, commands))
+
+
+def _cost_under(problem: OptimalControlProblem, commands: Commands) -> float:
+    """The cost of the motion under commands; infinite where it fails."""
+    try:
+        motion, failure = rollout(problem.scene, problem.integrator, problem.q0, problem.v0, commands, problem.dt)
+        return problem.cost_of(motion) if failure is None else np.inf
+    except VarpinError:
+        return np.inf
+
+
+def _joint_forces(problem: OptimalControlProblem, q: Floats, v: Floats) -> Floats:
+    """The joint forces (R, n) that controls have to give over each decision, on q and v (N + 1, n)."""
+    scene, period = problem.scene, problem.period
+    q, v = q[:: problem.hold], v[:: problem.hold]
+    at = 0.5 * (q[:-1] + q[1:])
+    rate, acceleration = np.diff(q, axis=0) / period, np.diff(v, axis=0) / period
+    # What servos add to the command that their springs need to hold their positions.
+    still = at @ scene.holding.T @ scene.actuation.T
+    found: Floats = core.inverse_dynamics(scene.core, at, rate, acceleration) - scene.core.forces(at, rate, still)[0]
+    return found

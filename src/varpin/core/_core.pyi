@@ -208,7 +208,7 @@ class Squares:
 
     def __init__(self, root: Floats, shift: Floats, linear: Floats) -> None: ...
 
-class _Found:
+class _Pass:
     @property
     def slope(self) -> float:
         """Sum of Qu . k."""
@@ -221,11 +221,6 @@ class _Found:
     @property
     def loss(self) -> float:
         """The largest relative rounding error of a pivot of Quu, or of its root."""
-
-class BackwardPass(_Found):
-    """The recursion from the terminal cost's gradient (2n,) and Hessian (2n, 2n) in x."""
-
-    def __init__(self, controls: int, gradient: Floats, hessian: Floats) -> None: ...
     def run(
         self,
         h: float,
@@ -244,40 +239,26 @@ class BackwardPass(_Found):
         control_gradient: Floats,
         spread: Floats,
         factors: Floats,
+        running: Squares = ...,
     ) -> int:
         """Pass over a block of N steps, the last block first; returns -1, or the decision without a minimum.
 
         Each control is held over ``hold`` steps, for R decisions. The linearized dynamics and the expanded costs are
-        described in src/core/include/varpin/steps.hpp. Written are the gains of u + k + K (x - x_nominal),
-        ``feedforward`` (R, m) and ``feedback`` (R, m, 2n); ``control_gradient`` (R, m) of the cost; with noise
-        ``spread`` (N, 2n, 2n), S; and ``factors`` (R, m, m), L D L' of the regularized Quu.
+        described in src/core/include/varpin/steps.hpp; ``running``, of a :class:`RootPass` alone, has the costs of the
+        steps as squares. Written are the gains of u + k + K (x - x_nominal), ``feedforward`` (R, m) and ``feedback``
+        (R, m, 2n); ``control_gradient`` (R, m) of the cost; with noise ``spread`` (N, 2n, 2n), S; and ``factors``
+        (R, m, m), L D L' of the regularized Quu.
         """
 
-class RootPass(_Found):
+class BackwardPass(_Pass):
+    """The recursion from the terminal cost's gradient (2n,) and Hessian (2n, 2n) in x."""
+
+    def __init__(self, controls: int, gradient: Floats, hessian: Floats) -> None: ...
+
+class RootPass(_Pass):
     """:class:`BackwardPass` on square roots, from the terminal cost in x as squares, and its gradient (2n,)."""
 
     def __init__(self, controls: int, terminal: Squares, gradient: Floats) -> None: ...
-    def run(
-        self,
-        h: float,
-        hold: int,
-        regularization: float,
-        *,
-        A: Floats,
-        B: Floats,
-        G: Floats,
-        Gx: Floats,
-        Gu: Floats,
-        gradient: Floats,
-        hessian: Floats,
-        feedforward: Floats,
-        feedback: Floats,
-        control_gradient: Floats,
-        spread: Floats,
-        factors: Floats,
-        running: Squares,
-    ) -> int:
-        """See :class:`BackwardPass`; ``running`` has the costs of the steps."""
 
 def foresee(
     hold: int,

@@ -133,7 +133,7 @@ def _folders(package_dirs: Sequence[str | os.PathLike[str]] | str | os.PathLike[
     if isinstance(package_dirs, str | os.PathLike):
         package_dirs = [package_dirs]
     try:
-        return tuple(str(Path(folder).expanduser()) for folder in package_dirs or ())
+        return tuple(str(Path(folder).expanduser()) for folder in (() if package_dirs is None else package_dirs))
     except (TypeError, RuntimeError):
         raise InputError(f"package_dirs must be a list of folders, got {package_dirs!r}") from None
 

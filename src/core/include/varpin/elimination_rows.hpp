@@ -1,4 +1,5 @@
-// Vectors and matrices of elimination (elimination.hpp), by pairs of numbers. Sizes are even.
+// Vectors and matrices of elimination (elimination.hpp), by pairs of numbers. Sizes are even. docs/mathematics.md,
+// "Linear in the number of joints".
 #pragma once
 
 #include "varpin/simd.hpp"

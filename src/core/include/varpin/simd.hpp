@@ -1,8 +1,8 @@
 // Two numbers in one vector register, and four in one or two; whether the processor has vectors of four; and products
 // of small matrices in tiles of 4 x 4 entries, whose sums stay in registers. Compilers vectorize long loops by
-// themselves, but not the short loops over the entries of a six-vector or a row of a small matrix. Functions that
-// profit are compiled twice from one inlined function, without fused multiply-add: identical results with half the
-// instructions of vectors of two. docs/core.md, "Processors".
+// themselves, but not the short loops over the entries of a six-vector or a row of a small matrix. The products are
+// inlined into a function that is compiled for both kinds of processor (backward.hpp), without fused multiply-add:
+// identical results, with half the instructions of vectors of two. docs/core.md, "Processors".
 #pragma once
 
 #include <algorithm>
@@ -31,29 +31,21 @@ typedef double Quad __attribute__((vector_size(32), aligned(8), may_alias));
 inline Quad& quad_at(double* x) { return *reinterpret_cast<Quad*>(x); }
 inline const Quad& quad_at(const double* x) { return *reinterpret_cast<const Quad*>(x); }
 
-#if defined(__x86_64__)
-
-namespace detail {
-
 // Whether processor and system have AVX2.
-inline bool find_avx2() {
-    unsigned a = 0, b = 0, c = 0, d = 0;
-    constexpr unsigned saved = 1u << 27, avx = 1u << 28, avx2 = 1u << 5;
-    if (!__get_cpuid(1, &a, &b, &c, &d) || (c & saved) == 0 || (c & avx) == 0) return false;
-    unsigned low = 0, high = 0;
-    __asm__("xgetbv" : "=a"(low), "=d"(high) : "c"(0));
-    if ((low & 6u) != 6u) return false;
-    return __get_cpuid_count(7, 0, &a, &b, &c, &d) && (b & avx2) != 0;
-}
-
-}  // namespace detail
-
 inline bool has_avx2() {
-    static const bool wide = detail::find_avx2();
-    return wide;
-}
-
+#if defined(__x86_64__)
+    static const bool found = [] {
+        unsigned a = 0, b = 0, c = 0, d = 0, low = 0, high = 0;
+        constexpr unsigned saved = 1u << 27, avx = 1u << 28, avx2 = 1u << 5;
+        if (!__get_cpuid(1, &a, &b, &c, &d) || (c & saved) == 0 || (c & avx) == 0) return false;
+        __asm__("xgetbv" : "=a"(low), "=d"(high) : "c"(0));
+        return (low & 6u) == 6u && __get_cpuid_count(7, 0, &a, &b, &c, &d) && (b & avx2) != 0;
+    }();
+    return found;
+#else
+    return false;
 #endif
+}
 
 // Matrices are padded with zeros to whole tiles, so that products have no remaining rows or columns.
 constexpr int tile = 4;
@@ -102,8 +94,8 @@ template <bool adds, int rows>
     }
 }
 
-// With `pairs`, two rows of tiles at a time: as many sums as hide the time that an addition takes.
-template <bool adds, bool pairs>
+// Two rows of tiles at a time: as many sums as hide the time that an addition takes.
+template <bool adds>
 [[gnu::always_inline]] inline void find_tiles(const TiledMatrix& a, const TiledMatrix& b, Range range, TiledMatrix& out,
                                               int rows, Part part) {
     const int columns = std::min(b.stride(), out.stride()), depth = range.end - range.begin;
@@ -112,7 +104,7 @@ template <bool adds, bool pairs>
         find_block<adds, tile>(top_a + i, a.stride(), top_b + j, b.stride(), depth, out[i] + j, out.stride());
     };
     int i = 0;
-    for (; pairs && i + tile < rows; i += 2 * tile) {
+    for (; i + tile < rows; i += 2 * tile) {
         int j = 0;
         if (part == Part::upper) {
             one(i, i);
@@ -126,33 +118,18 @@ template <bool adds, bool pairs>
     }
 }
 
-#if defined(__x86_64__)
-// The same sums four at a time: no other bytes, and half the instructions.
-template <bool adds>
-[[gnu::target("avx2")]] void find_tiles_by_avx2(const TiledMatrix& a, const TiledMatrix& b, Range range,
-                                                TiledMatrix& out, int rows, Part part) {
-    find_tiles<adds, true>(a, b, range, out, rows, part);
-}
-#endif
-
 }  // namespace detail
 
 // The leading `rows` rows of out += a'b, over the rows of a and b in `range`, for the columns that both have.
-inline void add_transposed_product(const TiledMatrix& a, const TiledMatrix& b, Range range, TiledMatrix& out, int rows,
-                                   Part part = Part::all) {
-#if defined(__x86_64__)
-    if (has_avx2()) return detail::find_tiles_by_avx2<true>(a, b, range, out, rows, part);
-#endif
-    detail::find_tiles<true, false>(a, b, range, out, rows, part);
+[[gnu::always_inline]] inline void add_transposed_product(const TiledMatrix& a, const TiledMatrix& b, Range range,
+                                                          TiledMatrix& out, int rows, Part part = Part::all) {
+    detail::find_tiles<true>(a, b, range, out, rows, part);
 }
 
 // The same of out = a'b: whatever was there is gone.
-inline void transposed_product(const TiledMatrix& a, const TiledMatrix& b, Range range, TiledMatrix& out, int rows,
-                               Part part = Part::all) {
-#if defined(__x86_64__)
-    if (has_avx2()) return detail::find_tiles_by_avx2<false>(a, b, range, out, rows, part);
-#endif
-    detail::find_tiles<false, false>(a, b, range, out, rows, part);
+[[gnu::always_inline]] inline void transposed_product(const TiledMatrix& a, const TiledMatrix& b, Range range,
+                                                      TiledMatrix& out, int rows, Part part = Part::all) {
+    detail::find_tiles<false>(a, b, range, out, rows, part);
 }
 
 namespace detail {
@@ -171,29 +148,15 @@ template <int tiles>
     for (int k = 0; k < tiles; ++k) quad_at(out + c + tile * k) = sum[k];
 }
 
-[[gnu::always_inline]] inline void add_some_rows(const double* __restrict factor, const TiledMatrix& a, Range range,
-                                                 double* __restrict out, int columns) {
-    int c = 0;
-    for (; c + 3 * tile < columns; c += 4 * tile) add_rows_at<4>(c, factor, a, range, out);
-    for (; c + tile < columns; c += 2 * tile) add_rows_at<2>(c, factor, a, range, out);
-    if (c < columns) add_rows_at<1>(c, factor, a, range, out);
-}
-
-#if defined(__x86_64__)
-[[gnu::target("avx2")]] inline void add_rows_by_avx2(const double* factor, const TiledMatrix& a, Range range,
-                                                     double* out, int columns) {
-    add_some_rows(factor, a, range, out, columns);
-}
-#endif
-
 }  // namespace detail
 
 // out += sum_i factor_i a_i over the rows of a in `range`, one after another; out has whole tiles.
-inline void add_rows(const double* factor, const TiledMatrix& a, Range range, double* out, int columns) {
-#if defined(__x86_64__)
-    if (has_avx2()) return detail::add_rows_by_avx2(factor, a, range, out, columns);
-#endif
-    detail::add_some_rows(factor, a, range, out, columns);
+[[gnu::always_inline]] inline void add_rows(const double* __restrict factor, const TiledMatrix& a, Range range,
+                                            double* __restrict out, int columns) {
+    int c = 0;
+    for (; c + 3 * tile < columns; c += 4 * tile) detail::add_rows_at<4>(c, factor, a, range, out);
+    for (; c + tile < columns; c += 2 * tile) detail::add_rows_at<2>(c, factor, a, range, out);
+    if (c < columns) detail::add_rows_at<1>(c, factor, a, range, out);
 }
 
 // Copy the upper triangle to the lower one, in these rows.

@@ -271,17 +271,12 @@ class VariationalStepper {
 
     // What differs under constraints.
 
-    // Enter the first node of a path.
-    virtual bool enter(PathState& state, bool project) {
-        static_cast<void>(project);
-        return factor_at(state);
-    }
+    // Enter the first node of a path, with or without a projection of its momentum.
+    virtual bool enter(PathState& state, bool) { return factor_at(state); }
     // Remove the part of a path's momentum that is normal to the constraints.
     virtual void absorb(PathState&) {}
-    // Read the goals of kinematic inputs, in `steps` steps, from `force`, and their rates from the controls.
-    virtual void take_goals(int steps, const double* controls = nullptr) {
-        static_cast<void>(steps), static_cast<void>(controls);
-    }
+    // Read the goals of kinematic inputs, so many steps ahead, from `force`, and their rates from the controls.
+    virtual void take_goals(int, const double* = nullptr) {}
     virtual void take_rates(const double*) {}
     // Solve the step equation of a substep from the guess.
     virtual Outcome solve(double h, PathState& state, bool jets_wanted) {
@@ -293,15 +288,9 @@ class VariationalStepper {
         return margin > 0.0 ? Outcome::solved : Outcome::fold;
     }
     // Finish the node in `trial`.
-    virtual Outcome end(double h, PathState& state, bool jets_wanted) {
-        static_cast<void>(h), static_cast<void>(state), static_cast<void>(jets_wanted);
-        return Outcome::solved;
-    }
+    virtual Outcome end(double, PathState&, bool) { return Outcome::solved; }
     // Follow a path that has moved to the node; `turned` if whole turns were removed.
-    virtual Outcome arrive(PathState& state, bool turned) {
-        static_cast<void>(state), static_cast<void>(turned);
-        return Outcome::solved;
-    }
+    virtual Outcome arrive(PathState&, bool) { return Outcome::solved; }
 
     Start start_of(const PathState& state) const {
         return {state.position.data(), state.p.data(), force.data(), stride, outer};

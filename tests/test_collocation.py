@@ -1,0 +1,378 @@
+"""Collocation, the midpoint rule among it: tableaux, closed forms, and what guards and Newton's method promise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import scipy.linalg
+from mechanisms import slider
+from refusals import refused
+
+import varpin as vp
+from varpin.integrators.tableau import gauss_coefficients, radau_coefficients
+from varpin.model.example_robot_data import FIXED_BASE
+
+GRAVITY = 9.81
+ALL = [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize("kind", ["gauss", "radau"])
+@pytest.mark.parametrize("stages", ALL)
+def test_tableau(kind, stages):
+    """Quadrature of order 2s, collocation of order s, b_i a_ij + b_j a_ji = b_i b_j; or order 2s - 1 and c_s = 1."""
+    a, b, c = gauss_coefficients(stages) if kind == "gauss" else radau_coefficients(stages)
+    for k in range(1, 2 * stages + (kind == "gauss")):
+        assert b @ c ** (k - 1) == pytest.approx(1 / k, rel=1e-14)
+    for k in range(1, stages + 1):
+        np.testing.assert_allclose(a @ c ** (k - 1), c**k / k, rtol=0, atol=1e-14 if kind == "radau" else 1e-15)
+    if kind == "radau":
+        assert c[-1] == 1.0
+        np.testing.assert_array_equal(b, a[-1])
+    else:
+        weighted = b[:, None] * a
+        np.testing.assert_allclose(weighted + weighted.T, np.outer(b, b), rtol=0, atol=1e-16)
+
+
+def oscillator(stiffness):
+    """A mass of 1 kg on a spring, nothing else."""
+    return vp.Scene(slider(), stiffness=stiffness, gravity=False)
+
+
+@pytest.mark.parametrize("stages", ALL)
+def test_a_spring_is_turned_by_the_pade_approximant(stages):
+    """One step of the oscillator is the diagonal Pade approximant of exp(h [[0, 1], [-k, 0]]), stiff or not."""
+    for product in (0.3, 5.0, 400.0):  # h sqrt(k)
+        motion = vp.simulate(
+            oscillator(product**2), [1.0], [0.7], dt=1.0, steps=1, integrator=vp.Gauss(stages), check=False
+        )
+        assert motion.statistics.split_steps == 0
+        Z = np.array([[0.0, 1.0], [-(product**2), 0.0]])
+        factors = [1.0]
+        for j in range(1, stages + 1):
+            factors.append(factors[-1] * (stages - j + 1) / (j * (2 * stages - j + 1)))
+        # Scaled, so that the powers of a stiff spring's matrix stay of one size.
+        S = np.diag([1.0, product])
+        Y = np.linalg.solve(S, Z @ S)
+        powers = [np.linalg.matrix_power(Y, j) for j in range(stages + 1)]
+        P = sum(f * power for f, power in zip(factors, powers, strict=True))
+        N = sum(f * (-1) ** j * power for j, (f, power) in enumerate(zip(factors, powers, strict=True)))
+        expected = np.linalg.solve(N, P @ [1.0, 0.7 / product])
+        given = np.array([motion.q[1, 0], motion.v[1, 0] / product])
+        np.testing.assert_allclose(given, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("stages", [1, 2, 3])
+def test_energy_round_off_walks_at_random(stages):
+    """A mass on a spring: Gauss collocation conserves quadratic energies exactly, so what is left is rounding."""
+    motion = vp.simulate(
+        oscillator(3.0), [1.0], [0.3], dt=2e-2, steps=200_000, integrator=vp.Gauss(stages), check=False
+    )
+    assert np.abs(motion.energy / motion.energy[0] - 1.0).max() < 50 * np.finfo(float).eps
+
+
+def test_an_oscillator_damped_far_faster_than_the_step_is_at_rest_after_it():
+    """The rational stability function: at h rate = 1000 what is left is below 1e-2, of Gauss nearly everything."""
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=1e5)
+    left = {
+        kind: abs(vp.simulate(scene, [0.0], [1.0], dt=1e-2, steps=1, integrator=kind, check=False).v[-1, 0])
+        for kind in (vp.Radau(2), vp.Radau(3), vp.Gauss(2))
+    }
+    assert left[vp.Radau(2)] < 1e-2
+    assert left[vp.Radau(3)] < 1e-2
+    assert left[vp.Gauss(2)] > 0.9
+
+
+def test_one_stage_is_the_implicit_euler_method():
+    """Of first order; a damper stops a joint by 1 / (1 + h rate); p1 = p0 + h (L_q + F) at the end of the step."""
+    euler = vp.Radau(1, guard=None)
+    assert euler.order == 1
+    scene = vp.Scene(vp.planar_chain(3), damping=0.1)
+    start = {"q0": np.zeros(3), "v0": np.ones(3)}
+    exact = vp.simulate(scene, **start, dt=0.5, steps=1, integrator=vp.Reference()).q[-1]
+    motions = [vp.simulate(scene, **start, dt=0.5 / n, steps=n, integrator=euler) for n in (240, 480)]
+    errors = [np.abs(motion.q[-1] - exact).max() for motion in motions]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(1.0, abs=0.1)
+
+    motion = motions[0]
+    v = np.diff(motion.q, axis=0)[0] / motion.dt
+    slope = vp.lagrangian_jet(scene, motion.q[1], v).Lq - 0.1 * v
+    np.testing.assert_allclose(motion.p[1] - motion.p[0], motion.dt * slope, rtol=0, atol=1e-12)
+
+    stiff = vp.Scene(vp.planar_chain(1), gravity=False, damping=1e5)
+    inertia = vp.lagrangian_jet(stiff, np.zeros(1), np.zeros(1)).Lvv[0, 0]
+    left = vp.simulate(stiff, [0.0], [1.0], dt=1e-2, steps=1, integrator=euler, check=False).v[-1, 0]
+    assert left == pytest.approx(1.0 / (1.0 + 1e-2 * 1e5 / inertia), rel=1e-9)
+
+
+@pytest.mark.parametrize("damping", [0.0, 1.0, 100.0])
+def test_one_stage_moves_from_rest_under_the_default_guard(damping):
+    """It loses a part of what a first step from rest gains, which is its first order and no fault of the step."""
+    scene = vp.Scene(vp.planar_chain(3), damping=damping)
+    motion = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-3, steps=100, integrator=vp.Radau(1), check=False)
+    assert motion.statistics.substeps.max() == 1
+    free = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-3, steps=100, integrator=vp.Radau(1, guard=None))
+    np.testing.assert_allclose(motion.q, free.q, rtol=0, atol=1e-12)
+
+
+def test_a_spring_beside_a_damper_keeps_its_energy():
+    """The default takes Radau for the one; the other swings by itself, undamped, at a radian a step."""
+    model, inertia = pin.Model(), 0.33
+    for name in ("spring", "damper"):
+        joint = model.addJoint(0, pin.JointModelRY(), pin.SE3.Identity(), name)
+        model.appendBodyToJoint(joint, pin.Inertia(1.0, np.zeros(3), inertia * np.eye(3)), pin.SE3.Identity())
+    stiffness = inertia * 50.0**2
+    scene = vp.Scene(vp.load_robot(model), gravity=False, stiffness=[stiffness, 0.0], damping=[0.0, 100.0])
+    motion = vp.simulate(scene, [0.5, 0.0], [0.0, 1.0], dt=0.02, steps=500)
+    assert motion.integrator == str(vp.Radau(4))
+    energy = 0.5 * (stiffness * motion.q[:, 0] ** 2 + inertia * motion.v[:, 0] ** 2)
+    np.testing.assert_allclose(energy / energy[0], 1.0, rtol=0, atol=0.01)
+    exact = 0.5 * np.cos(50.0 * motion.t)
+    assert np.abs(motion.q[:, 0] - exact).max() < 0.005
+
+
+@pytest.mark.parametrize("stages", [1, 2, 3, 6])
+@pytest.mark.parametrize("stiffness", [1e-2, 1e2, 1e4])
+@pytest.mark.parametrize("damping", [0.0, 1e-2, 1e4])
+def test_stiff_springs_and_dampers(stages, stiffness, damping):
+    """Springs and dampers far faster than the step: finite, bounded, and dissipating what they should."""
+    scene = vp.Scene(vp.load_robot("finger"), gravity=False, stiffness=stiffness, damping=damping)
+    motion = vp.simulate(
+        scene, [0.1, 0.1, 0.1], np.zeros(3), dt=1e-2, steps=100, integrator=vp.Gauss(stages), check=False
+    )
+    assert np.isfinite(motion.q).all()
+    if damping == 0.0:
+        assert np.abs(motion.energy / motion.energy[0] - 1.0).max() < 0.1
+    else:
+        assert motion.energy[-1] < motion.energy[0]
+        assert motion.energy.max() <= motion.energy[0] * (1.0 + 1e-9)
+
+
+# Integrators, links of chains that fall from rest, steps [s], largest error of the energy in units of g L^2 / 2.
+COARSE = [(vp.Gauss(s), (2, 3, 5), (0.02, 0.05, 0.1, 0.2, 0.5), 0.05 if s == 1 else 0.01) for s in (1, 2, 3, 4, 6)]
+COARSE += [(vp.Midpoint(alpha=alpha), (3,), (0.01, 0.05, 0.2), 0.2) for alpha in (0.0, 0.25, 0.45, 0.75, 1.0)]
+
+
+@pytest.mark.parametrize("duration", [20.0, pytest.param(1000.0, marks=pytest.mark.slow)], ids=["20 s", "1000 s"])
+@pytest.mark.parametrize(("integrator", "chains", "dts", "limit"), COARSE, ids=[str(own[0]) for own in COARSE])
+def test_no_silent_energy_jump_at_coarse_steps(integrator, chains, dts, limit, duration):
+    for links in chains:
+        scene, still = vp.Scene(vp.planar_chain(links)), np.zeros(links)
+        for dt in dts:
+            motion = vp.simulate(scene, still, still, dt=dt, steps=int(duration / dt), integrator=integrator)
+            assert np.abs(motion.energy - motion.energy[0]).max() < limit * GRAVITY * links**2 / 2
+            assert motion.statistics.branch_margin.min() > 0.0
+            if dt > 0.1:
+                assert motion.statistics.split_steps > 0
+
+
+@pytest.mark.parametrize(("stages", "dt"), [(2, 0.02), (2, 0.05), (3, 0.1)])
+def test_free_motions_keep_their_energy(stages, dt):
+    """The guard's budget is a hundredth of the one of one stage: a thousandth of the kinetic energy is kept so."""
+    scene = vp.Scene(vp.planar_chain(3), damping=0.0)
+    options = {"dt": dt, "steps": round(3.0 / dt), "integrator": vp.Radau(stages), "check": False}
+    motion = vp.simulate(scene, [0.3, 1.2, -0.8], [2.0, -3.0, 4.0], **options)
+    kinetic = [0.5 * v @ vp.lagrangian_jet(scene, q, v).Lvv @ v for q, v in zip(motion.q, motion.v, strict=True)]
+    assert motion.statistics.split_steps > 0
+    assert np.abs(motion.energy - motion.energy[0]).max() < 1e-3 * max(kinetic)
+
+
+@pytest.mark.parametrize("links", [16, 32, pytest.param(100, marks=pytest.mark.slow)])
+def test_long_chains_fall_for_ten_seconds(links):
+    motion = vp.simulate(
+        vp.Scene(vp.planar_chain(links)),
+        np.zeros(links),
+        np.zeros(links),
+        dt=1e-2,
+        steps=1000,
+        integrator=vp.Midpoint(),
+    )
+    evaluations = motion.statistics.jets.sum() + motion.statistics.sweeps.sum()
+    assert evaluations / motion.statistics.substeps.sum() <= 6.0
+    assert np.abs(motion.energy - motion.energy[0]).max() < 0.05 * GRAVITY * links**2 / 2
+
+
+def test_a_heavy_part_does_not_hide_a_light_one():
+    """A slider of 1000 kg falls beside three links of 1 kg: the links' own energy is kept as if they were alone."""
+    chain = vp.planar_chain(3)
+    model = chain.model.copy()
+    joint = model.addJoint(0, pin.JointModelPZ(), pin.SE3.Identity(), "slide")
+    model.appendBodyToJoint(joint, pin.Inertia.FromSphere(1000.0, 0.1), pin.SE3.Identity())
+    both = vp.Scene(vp.load_robot(model))
+    assert both.robot.joint_names[-1] == "slide"
+    motion = vp.simulate(both, np.zeros(4), np.zeros(4), dt=0.1, steps=200, integrator=vp.Midpoint())
+    alone = vp.Scene(chain)
+    jets = [vp.lagrangian_jet(alone, q[:3], v[:3]) for q, v in zip(motion.q, motion.v, strict=True)]
+    energy = np.array([jet.Lv @ v[:3] - jet.L for jet, v in zip(jets, motion.v, strict=True)])
+    assert np.abs(energy - energy[0]).max() < 0.05 * GRAVITY * 9 / 2
+
+
+@pytest.mark.parametrize("dt", [0.05, 0.2])
+def test_a_constant_torque_is_guarded_like_a_potential(dt):
+    """The same physics twice: springs slack at 1.5 rad, and springs slack at 0 and a torque."""
+    chain, start = vp.planar_chain(3), (np.zeros(3), np.zeros(3))
+    steps = int(200 / dt)
+    spring = vp.simulate(
+        vp.Scene(chain, stiffness=20.0, rest=1.5), *start, dt=dt, steps=steps, integrator=vp.Midpoint()
+    )
+    torque = vp.simulate(
+        vp.Scene(chain, stiffness=20.0), *start, dt=dt, steps=steps, controls=np.full(3, 30.0), integrator=vp.Midpoint()
+    )
+    for energy in (spring.energy, torque.energy - 30.0 * torque.q.sum(axis=1)):
+        assert np.abs(energy - energy[0]).max() < 0.1 * GRAVITY * 9 / 2
+    errors = np.abs(torque.energy - 30.0 * torque.q.sum(axis=1) - torque.energy[0])
+    np.testing.assert_allclose(torque.statistics.energy_defect, errors[1:], rtol=0, atol=1e-9)
+
+
+def test_without_the_energy_guard_there_are_silent_jumps():
+    """What the guard is for: without it runs at coarse steps jump to other branches of solutions."""
+    unguarded = vp.Midpoint(guard=vp.Guard(energy_balance=1e12, energy_budget=1e12))
+    scene = vp.Scene(vp.planar_chain(2))
+    try:
+        motion = vp.simulate(scene, np.zeros(2), np.zeros(2), dt=0.1, steps=2000, integrator=unguarded)
+    except vp.StepFailure as failure:
+        motion = failure.trajectory
+    assert np.abs(motion.energy - motion.energy[0]).max() > 20.0 * GRAVITY * 4 / 2
+
+
+def test_without_a_guard_no_step_is_cut():
+    scene = vp.Scene(vp.planar_chain(3))
+    start = {"q0": np.zeros(3), "v0": np.full(3, 8.0), "dt": 0.1, "steps": 20}
+    guarded = vp.simulate(scene, **start)
+    assert guarded.statistics.split_steps > 0
+    try:
+        plain = vp.simulate(scene, **start, integrator=vp.Midpoint(guard=None))
+    except vp.StepFailure as failure:
+        plain = failure.trajectory
+    assert (plain.statistics.substeps <= 1).all()
+    assert np.isinf(plain.statistics.branch_margin).all()
+
+
+def test_branch_margin_bounds_the_smallest_eigenvalue():
+    """The recorded margin against dense eigenvalues of M^-1 (M - h^2/4 L_qq / (1 - 1/2)) at the root."""
+    scene = vp.Scene(vp.planar_chain(3))
+    unguarded = vp.Midpoint(guard=vp.Guard(energy_balance=1e12, energy_budget=1e12))
+    rng = np.random.default_rng(0)
+    margins = []
+    for _ in range(40):
+        q, v, dt = rng.uniform(-2, 2, 3), rng.normal(size=3) * 10, rng.uniform(1e-2, 0.1)
+        motion = vp.simulate(scene, q, v, dt=dt, steps=1, integrator=unguarded)
+        if motion.statistics.split_steps:
+            continue
+        jet = vp.lagrangian_jet(scene, 0.5 * (motion.q[0] + motion.q[1]), (motion.q[1] - motion.q[0]) / dt)
+        smallest = scipy.linalg.eigh(jet.Lvv - dt**2 / 2 * jet.Lqq, jet.Lvv, eigvals_only=True)[0]
+        assert 0.0 < smallest <= motion.statistics.branch_margin[0] * (1.0 + 1e-2)
+        margins.append(smallest)
+    assert min(margins) < 0.5
+    assert len(margins) > 20
+
+
+def test_failure_keeps_what_was_done():
+    scene = vp.Scene(vp.planar_chain(3))
+    with refused(vp.StepFailure, "dt") as caught:
+        vp.simulate(
+            scene, np.zeros(3), np.zeros(3), dt=1e-2, steps=1000, controls=np.full(3, 1e6), integrator=vp.Midpoint()
+        )
+    error = caught.value
+    assert error.trajectory.steps == error.step > 0
+    assert error.time == pytest.approx(error.step * 1e-2)
+    np.testing.assert_array_equal(error.q, error.trajectory.q[-1])
+    np.testing.assert_array_equal(error.p, error.trajectory.p[-1])
+    assert np.isfinite(error.trajectory.energy).all()
+    assert str(error.step) in str(error)
+    assert error.reason in str(error)
+
+
+@pytest.mark.parametrize("name", [*(name for name in FIXED_BASE if not name.startswith("bravo7")), "finger"])
+def test_few_iterations_from_rest_under_gravity(name):
+    robot = vp.load_robot(name)
+    tilted = vp.Scene(robot, gravity=[3.0, -5.0, -8.0])
+    for scene, q0 in ((vp.Scene(robot), 0.0), (tilted, 0.5)):
+        motion = vp.simulate(
+            scene, np.full(robot.dof, q0), np.zeros(robot.dof), dt=1e-3, steps=300, integrator=vp.Midpoint()
+        )
+        assert motion.statistics.newton_iterations.mean() <= 3.0
+        assert motion.statistics.residual.max() < 20.0
+
+
+@pytest.mark.parametrize("links", [3, 7])
+def test_few_evaluations(links):
+    """One jet a stage on most steps, and first-order sweeps for the rest."""
+    scene = vp.Scene(vp.planar_chain(links))
+    for stages in ALL:
+        motion = vp.simulate(scene, np.zeros(links), np.zeros(links), dt=2e-2, steps=50, integrator=vp.Gauss(stages))
+        assert motion.statistics.jets.mean() / stages < 1.5
+        assert motion.statistics.sweeps.mean() / stages < 3.0
+        assert motion.statistics.residual.max() < 1.0
+
+
+def arm_on(slider):
+    """Two joints that turn, and one that slides on them or below them."""
+    joints = [pin.JointModelRY(), pin.JointModelRY()]
+    joints.insert({"an arm": 2, "a rail": 0}[slider], pin.JointModelPX())
+    model, parent = pin.Model(), 0
+    for k, joint in enumerate(joints):
+        placement = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.5 * (k > 0)]))
+        parent = model.addJoint(parent, joint, placement, f"joint{k}")
+        body = pin.Inertia(1.0, np.array([0.05, 0.0, 0.2]), 0.02 * np.eye(3))
+        model.appendBodyToJoint(parent, body, pin.SE3.Identity())
+    return vp.load_robot(model)
+
+
+# What a correction leaves is estimated where inertia and gravity alone bend the step equation. Scenes, steps [s], and
+# whether corrections go unseen.
+UNSEEN = {
+    "chain": (lambda: vp.Scene(vp.planar_chain(3)), 5e-4, True),
+    "long chain, eliminated": (lambda: vp.Scene(vp.planar_chain(30)), 5e-4, True),
+    "springs and dampers": (lambda: vp.Scene(vp.load_robot("ur5"), damping=0.5, stiffness=2.0, rest=0.1), 5e-4, True),
+    "on a rail": (lambda: vp.Scene(arm_on("a rail")), 5e-4, True),
+    "slider on an arm": (lambda: vp.Scene(arm_on("an arm")), 5e-3, False),
+    "friction": (lambda: vp.Scene(vp.planar_chain(3), forces=[vp.CoulombFriction(0.1)]), 5e-3, False),
+}
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)], ids=str)
+@pytest.mark.parametrize("name", UNSEEN)
+def test_a_correction_that_leaves_nothing_is_not_looked_at(name, integrator):
+    """And the motion is, to rounding, that of steps each of which is looked at until it stagnates."""
+    make, dt, unseen = UNSEEN[name]
+    scene = make()
+    q0 = np.random.default_rng(5).uniform(0.0, 0.5, scene.robot.dof)
+
+    def motion(integrator):
+        return vp.simulate(scene, q0, np.zeros_like(q0), dt=dt, steps=100, integrator=integrator, check=False)
+
+    own, seen = motion(integrator), motion(replace(integrator, tolerance=1e-300))
+    stages = getattr(integrator, "stages", 1)
+    late = own.statistics.sweeps[20:]
+    assert np.mean(late == 0) > 0.9 if unseen else np.any(late >= stages)
+    assert np.mean(seen.statistics.sweeps >= stages) > 0.9
+    for ours, theirs in ((own.q, seen.q), (own.p, seen.p)):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=2e-13 * np.abs(theirs).max())
+
+
+@pytest.mark.parametrize(
+    ("kind", "option", "facts"),
+    [
+        *((kind, *own) for kind in (vp.Gauss, vp.Radau) for own in (
+            ({"stages": 0}, ("stages", "1", "0")),
+            ({"stages": 7}, ("stages", "6", "7")),
+            ({"stages": 2.5}, ("stages", "2.5")),
+            ({"stages": "two"}, ("stages", "'two'")),
+            ({"guard": 3}, ("guard", "varpin.Guard", "None", "3")),
+        )),
+        *((kind, *own) for kind in (vp.Gauss, vp.Radau, vp.Midpoint) for own in (
+            ({"tolerance": 0.0}, ("tolerance", "0.0")),
+            ({"kick": "right"}, ("kick", "'left'", "'split'", "'right'")),
+        )),
+        (vp.Midpoint, {"alpha": 1.5}, ("alpha", "[0, 1]", "1.5")),
+        (vp.Guard, {"branch_margin": 1.0}, ("branch_margin", "[0, 1)", "1")),
+        (vp.Guard, {"energy_balance": -1.0}, ("energy_balance", "-1.0")),
+        (vp.Guard, {"energy_budget": np.nan}, ("energy_budget", "nan")),
+        (vp.Guard, {"max_halvings": 31}, ("max_halvings", "30", "31")),
+        (vp.Guard, {"max_halvings": 1.5}, ("max_halvings", "1.5")),
+    ],
+)  # fmt: skip
+def test_options_out_of_range(kind, option, facts):
+    with refused(vp.InputError, facts):
+        kind(**option)
