@@ -90,7 +90,7 @@ def test_errors_of_a_call(urdf):
         robot.posture("leg/home")
     with refused(vp.UnknownJoint, "'j9'"):
         robot.posture("home", others={"j9": 1.0})
-    with refused(vp.UnknownPosture, "SRDF"):
+    with refused(vp.UnknownPosture, "srdf=path"):
         vp.load_robot("ur5").posture("home")
 
 

@@ -117,7 +117,8 @@ def _model(root: ET.Element, path: Path) -> tuple[pin.Model, tuple[Inertial, ...
         if part.tag in ("link", "joint"):
             kept = ET.SubElement(small, part.tag, part.attrib)
             kept.extend(part if part.tag == "joint" else part.findall("inertial"))
-    model, complaint = _built(small)
+    text = ET.tostring(small, encoding="unicode")
+    model, complaint = _built(text)
     expand = "${" in complaint or "$(" in complaint or (model is None and bool(_xacro(root)))
     complaint = textwrap.shorten(complaint, _COMPLAINT)
     if re.search(r"\d,\d", complaint):
@@ -131,9 +132,7 @@ def _model(root: ET.Element, path: Path) -> tuple[pin.Model, tuple[Inertial, ...
     if lost := [repr(link.get("name")) for link in root.findall("link") if link.get("name") not in bodies]:
         raise RobotError(f"{path}: links {listed(lost, 'links')} are on a loop of joints without a root")
     # Pinocchio merges links on fixed joints into one body: with joints that move, each link is one.
-    for joint in small.iterfind("joint[@type='fixed']"):
-        joint.set("type", "continuous")
-    apart = _built(small)[0]
+    apart = _built(text.replace(' type="fixed"', ' type="continuous"'))[0]
     given = {link.get("name", "") for link in root.findall("link[inertial]")}
     found = []
     for frame in apart.frames:
@@ -143,11 +142,11 @@ def _model(root: ET.Element, path: Path) -> tuple[pin.Model, tuple[Inertial, ...
     return model, tuple(found), complaint
 
 
-def _built(root: ET.Element) -> tuple[Any, str]:
+def _built(text: str) -> tuple[Any, str]:
     """Pinocchio's model of a URDF, None if it has none, and its complaints."""
     with captured_stderr() as complaints:
         try:
-            return pin.buildModelFromXML(ET.tostring(root, encoding="unicode")), "; ".join(complaints())
+            return pin.buildModelFromXML(text), "; ".join(complaints())
         except (ValueError, RuntimeError, IndexError) as error:
             return None, "; ".join(complaints()) or str(error)
 
@@ -213,7 +212,7 @@ def _missing_meshes(urdf: Urdf, packages: Packages) -> dict[str, str]:
 
 
 def read_xml(path: Path, text: str | None = None, kind: str = "") -> ET.Element:
-    """The root element of an XML file, with prefixes as written; of a URDF or an SRDF it is ``<robot>``."""
+    """The elements of an XML file without texts, prefixes as written; the root of a URDF or an SRDF is ``<robot>``."""
     try:
         content = path.read_bytes() if text is None else text.encode()
     except OSError as error:
@@ -223,9 +222,8 @@ def read_xml(path: Path, text: str | None = None, kind: str = "") -> ET.Element:
     # Comments often contain "--", which XML forbids. Their line breaks stay, for line numbers.
     content = _COMMENT.sub(lambda found: found[1] or b"\n" * found[0].count(b"\n"), content.lstrip(b" \t\r\n"))
     builder, parser = ET.TreeBuilder(), expat.ParserCreate()
-    parser.buffer_text = True
     parser.StartElementHandler = lambda tag, has: builder.start(tag, {key: text.strip() for key, text in has.items()})
-    parser.EndElementHandler, parser.CharacterDataHandler = builder.end, builder.data
+    parser.EndElementHandler = builder.end
     try:
         parser.Parse(content, True)
     except (expat.ExpatError, LookupError) as error:
