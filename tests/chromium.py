@@ -119,9 +119,9 @@ def shape_poses(browser, figure="robot"):
 
 def shapes_stand(browser, robot, q, figure="robot", shift=0.0):
     """Whether every shape of a robot, or every moving one of its ghost, is where Pinocchio puts it, and shifted."""
-    model, shapes = robot.free_model, geometry(robot)
+    model, shapes = robot.model, geometry(robot)
     data, placements = model.createData(), shapes.createData()
-    pin.updateGeometryPlacements(model, data, shapes, placements, robot.free_positions(np.asarray(q)))
+    pin.updateGeometryPlacements(model, data, shapes, placements, robot.configuration(np.asarray(q)))
     poses = shape_poses(browser, figure)
     moving = [k for k, shape in enumerate(shapes.geometryObjects) if shape.parentJoint > 0]
     assert sorted(poses) == (moving if figure.startswith("ghost") else list(range(shapes.ngeoms)))

@@ -119,7 +119,7 @@ def random_tree(
 
 def mass_matrix(robot: vp.Robot, q: np.ndarray, data: pin.Data) -> np.ndarray:
     """M(q) (n, n) by Pinocchio's composite rigid body algorithm, armature included [kg m^2, kg m or kg]."""
-    full = pin.crba(robot.free_model, data, robot.free_positions(q))
+    full = pin.crba(robot.model, data, robot.configuration(q))
     full = np.triu(full) + np.triu(full, 1).T
-    G = robot.free_velocities(np.eye(robot.dof)).T
+    G = robot.velocity(np.eye(robot.dof)).T
     return G.T @ full @ G

@@ -83,7 +83,7 @@ def energies(model: pin.Model, positions, rates, gravity) -> tuple[np.ndarray, n
 
 def lagrangian(scene: vp.Scene, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """L of a scene at q, v (..., n)."""
-    model, names = scene.robot.free_model, list(scene.robot.joint_names)
+    model, names = scene.robot.model, list(scene.robot.joint_names)
     ties = {tie.follower: tie for tie in scene.robot.ties}
     positions, rates = [], []
     for joint in range(1, model.njoints):

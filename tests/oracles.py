@@ -52,7 +52,7 @@ class Mechanism:
     def __init__(self, scene: vp.Scene, path: Path | None = None) -> None:
         robot = scene.robot
         self.scene, self.path, self.names = scene, path, list(robot.joint_names)
-        self.model = robot.free_model.copy()
+        self.model = robot.model.copy()
         self.model.gravity.linear = scene.gravity
         self.data, self.n = self.model.createData(), robot.dof
         # Coordinates to joints: leaders, and followers of mimic joints; a continuous joint is cos and sin.

@@ -145,6 +145,9 @@ SMALL: dict[str, Case] = {
     "held, between nodes": Case(
         lambda: reach(speeds(1.8), between_nodes=True, dt=0.09, steps=8), 3.5974214, kkt=None, within=3.6e-4
     ),
+    "held over 2 steps, between nodes": Case(
+        lambda: reach(speeds(1.8), between_nodes=True, hold=2), 3.6647232, kkt=None, within=3.6e-4
+    ),
     "held, sphere between nodes": Case(
         lambda: reach(vp.KeepOutOfSphere(TWO, "tip", [1.3, 0.0, -1.3], 0.3), between_nodes=True, dt=0.09, steps=8),
         31.882135,
@@ -274,6 +277,30 @@ def kinova_near_speeds() -> vp.OptimalControlProblem:
     return vp.OptimalControlProblem(scene, cost, [*begin, -0.09503175088201599], np.zeros(6), **given)
 
 
+def kinova_that_falls() -> vp.OptimalControlProblem:
+    """A first motion that costs ten thousand times what the plan does."""
+    robot, rest = vp.load_robot("kinova"), np.zeros(6)
+    cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost(rest + 0.3, 100.0) + vp.VelocityCost(1.0))
+    given = {"dt": 0.05, "steps": 10, "constraints": [vp.WithinVelocityLimits(robot, (-1.0, 1.0))]}
+    return vp.OptimalControlProblem(vp.Scene(robot), cost, rest, rest, **given)
+
+
+def nearly_free() -> vp.OptimalControlProblem:
+    """A goal beyond a limit, without which it would cost next to nothing."""
+    cost = vp.ControlCost(1e-7) + vp.Terminal(vp.TrackingCost([1.3], 100.0) + vp.VelocityCost(1.0))
+    robot = vp.planar_chain(1)
+    given = {"dt": 0.02, "steps": 40, "constraints": [vp.WithinJointLimits(robot, (-6.0, 1.0))]}
+    return vp.OptimalControlProblem(vp.Scene(robot, damping=0.5), cost, [0.0], [0.0], **given)
+
+
+def nothing_at_first() -> vp.OptimalControlProblem:
+    """A goal, and a first motion that costs next to nothing."""
+    cost = vp.ControlCost(0.1, reference=[1e-6, 0.0]) + vp.VelocityCost(0.02) + vp.Terminal(vp.VelocityCost(10.0))
+    goal = vp.ReachFrame(TWO, "tip", position=TWO.frame_positions([1.0, 0.5], "tip"))
+    scene, given = vp.Scene(TWO, gravity=False, damping=0.1), {"dt": 0.05, "steps": 24, "constraints": [goal]}
+    return vp.OptimalControlProblem(scene, cost, [0.0, 0.1], REST, **given)
+
+
 ARMS: dict[str, Case] = {
     "UR5, speeds": Case(lambda: arm(*UR5, lambda r, *_: [vp.WithinVelocityLimits(r, (-0.8, 0.8))]), 0.45339862),
     "UR5, speeds and torques": Case(ur5_torques, 0.28243473),
@@ -306,6 +333,17 @@ ARMS: dict[str, Case] = {
         ),
         0.10137364,
     ),
+    "Kinova, sphere between nodes": Case(
+        lambda: arm(
+            *KINOVA,
+            lambda r, begin, end: [
+                vp.KeepOutOfSphere(r, r.end_effector, at(r, 0.5 * (begin + end)) + np.array([0, 0, 0.02]), 0.06)
+            ],
+            between_nodes=True,
+        ),
+        0.10137404,
+        within=1e-4,
+    ),
     "Z1, speeds, linear": Case(
         lambda: arm(*Z1, lambda r, *_: [vp.WithinVelocityLimits(r, (-0.45, 0.45))], controls="linear"),
         0.45452603,
@@ -319,5 +357,8 @@ HARD: dict[str, Case] = {
     "two links in more haste": Case(lambda: hasty([1.32, 1.05], 0.95, 19, 1.4, 29.0), 0.63806531),
     "Panda, goal at greatest speeds": Case(panda_at_speed, 0.13662213),
     "Kinova, speeds met by a hair": Case(kinova_near_speeds, 0.0023766076),
+    "Kinova, a fall at first": Case(kinova_that_falls, 0.0025351367),
+    "a limit before a goal": Case(nearly_free, 9.0074427),
+    "no cost at first": Case(nothing_at_first, 16.0767),
 }
 CASES = SMALL | ARMS | HARD

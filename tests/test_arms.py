@@ -44,9 +44,9 @@ def exact(scene, q0, rows, dt):
         force = scene.actuation @ u - scene.damping * v - level * np.tanh(v / width)
         if not robot.ties:
             return np.concatenate([v, pin.aba(model, data, robot.configuration(q), v, force)])
-        free, rate = robot.free_model, robot.free_velocities(np.eye(n))
+        free, rate = robot.model, robot.velocity(np.eye(n))
         tied = free.createData()
-        at, speed = robot.free_positions(q), robot.free_velocities(v)
+        at, speed = robot.configuration(q), robot.velocity(v)
         mass = rate @ pin.crba(free, tied, at) @ rate.T
         return np.concatenate([v, np.linalg.solve(mass, force - rate @ pin.rnea(free, tied, at, speed, 0.0 * speed))])
 

@@ -11,36 +11,54 @@ import varpin as vp
 
 UR5 = vp.load_robot("ur5")
 NAMES = UR5.joint_names
-POSE = {"elbow_joint": 1.1, "shoulder_lift_joint": -0.7}
-ROW = np.array([0.0, -0.7, 1.1, 0.0, 0.0, 0.0])
+SCENE = vp.Scene(UR5, damping=0.1)
+POSE = {"elbow_joint": 1.1, "shoulder_lift_joint": 0.7}
+ROW = np.array([0.0, 0.7, 1.1, 0.0, 0.0, 0.0])
+STEPS = {"dt": 2e-3, "steps": 10}
+# Margins of limits in which the motion is.
+WIDE, WIDE_ROW = {"elbow_joint": 3.1, "shoulder_lift_joint": 6.2}, np.array([0.0, 6.2, 3.1, 0.0, 0.0, 0.0])
 
 
-def same(a: vp.Trajectory, b: vp.Trajectory) -> bool:
-    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("q", "v", "p", "energy"))
+def motion(q=ROW, v=ROW, scene=SCENE, **options):
+    return vp.simulate(scene, q, v, **STEPS, **options)
 
 
-def test_motions_start_where_names_say():
-    scene = vp.Scene(UR5, damping=0.1)
-    options = {"dt": 2e-3, "steps": 20, "integrator": vp.Midpoint()}
-    rows = vp.simulate(scene, ROW, 0.1 * ROW, **options)
-    spin = {name: 0.1 * value for name, value in POSE.items()}
-    assert same(vp.simulate(scene, POSE, spin, **options), rows)
-    ensemble = vp.simulate_ensemble(scene, POSE, spin, paths=2, rng=0, workers=1, **options)
-    np.testing.assert_allclose(ensemble.q[1], rows.q, atol=1e-12)
+def problem(q=ROW, v=ROW, cost=None, scene=SCENE, **options):
+    cost = vp.ControlCost(1.0) if cost is None else cost + vp.ControlCost(1.0)
+    return vp.OptimalControlProblem(scene, cost, q, v, **STEPS, **options)
 
 
-def test_problems_jets_and_reports_take_names_too():
-    scene = vp.Scene(UR5)
-    problem = vp.OptimalControlProblem(scene, vp.ControlCost(1.0), POSE, {"wrist_3_joint": 2.0}, dt=0.01, steps=5)
-    assert problem.q0.tolist() == ROW.tolist()
-    assert problem.v0.tolist() == [0, 0, 0, 0, 0, 2]
-    assert problem.at(q0={"elbow_joint": 0.5}).q0.tolist() == [0, 0, 0.5, 0, 0, 0]
-    for backend in ("compiled", "pinocchio"):
-        by_row = vp.lagrangian_jet(scene, ROW, np.zeros(6), backend=backend)
-        assert np.array_equal(vp.lagrangian_jet(scene, POSE, {}, backend=backend).Lq, by_row.Lq)
-    assert vp.inspect_robot(UR5, q=POSE, v={"elbow_joint": 1.0}).q.tolist() == ROW.tolist()
-    step = vp.discrete_lagrangian(scene, POSE, POSE, 0.01)
-    assert step.Ld == vp.discrete_lagrangian(scene, ROW, ROW, 0.01).Ld
+def value(cost):
+    task = problem(cost=cost)
+    return task.cost_of(task.simulate(np.linspace(0.0, 1.0, task.scene.controls)))
+
+
+# What is computed of joint values: the same whether they are given by name or as a row.
+SAME = {
+    "start": lambda x: motion(x, x).p,
+    "paths": lambda x: vp.simulate_ensemble(SCENE, x, x, paths=2, rng=0, workers=1, **STEPS).q[1],
+    "torques": lambda x: motion(controls=x).u,
+    "torques of paths": lambda x: vp.simulate_ensemble(SCENE, ROW, ROW, controls=x, paths=1, rng=0, **STEPS).u[0],
+    "problem": lambda x: [problem(x, x).q0, problem(x, x).v0, problem().at(q0=x).q0],
+    "jet": lambda x: [vp.lagrangian_jet(SCENE, x, x, backend=name).Lq for name in ("compiled", "pinocchio")],
+    "report": lambda x: [vp.inspect_robot(UR5, q=x, v=x).q, vp.inspect_robot(UR5, q=x, v=x).v],
+    "discrete Lagrangian": lambda x: vp.discrete_lagrangian(SCENE, x, x, 0.01).D1,
+    "noise": lambda x: motion(scene=vp.Scene(UR5, noise=vp.AdditiveNoise(x) + vp.StateNoise(x, 0.1)), rng=5).q,
+    "noise's middle": lambda x: motion(scene=vp.Scene(UR5, noise=vp.StateNoise(1.0, x)), rng=5).q,
+    "tracking": lambda x: value(vp.TrackingCost(x, x)),
+    "speeds": lambda x: value(vp.VelocityCost(x, x)),
+    "barrier": lambda x: value(vp.JointLimitBarrier(UR5, x, WIDE if x is POSE else WIDE_ROW)),
+    "control cost": lambda x: value(vp.ControlCost(x, x)),
+    "rate cost": lambda x: value(vp.ControlRateCost(x, x)),
+}
+
+
+@pytest.mark.parametrize("use", SAME)
+def test_values_by_name_are_those_of_a_row(use):
+    found = np.array(SAME[use](POSE))
+    np.testing.assert_array_equal(found, SAME[use](ROW))
+    assert np.abs(found - SAME[use](0.5 * ROW)).max() > 1e-6
+    assert repr(vp.TrackingCost(0.0, POSE)) == f"TrackingCost(weight={POSE})"
 
 
 @pytest.mark.parametrize(
@@ -74,10 +92,10 @@ def test_holding_torque_is_pinocchios_gravity_and_the_springs(name):
     rng = np.random.default_rng(3)
     q, stiffness, rest = rng.uniform(-1, 1, (3, robot.dof))
     scene = vp.Scene(robot, gravity=(1.0, -2.0, -7.0), stiffness=np.abs(stiffness), rest=rest)
-    model = robot.free_model.copy()
+    model = robot.model.copy()
     model.gravity = pin.Motion(np.array([1.0, -2.0, -7.0]), np.zeros(3))
-    pull = pin.computeGeneralizedGravity(model, model.createData(), robot.free_positions(q))
-    expected = robot.free_velocities(np.eye(robot.dof)) @ pull + np.abs(stiffness) * (q - rest)
+    pull = pin.computeGeneralizedGravity(model, model.createData(), robot.configuration(q))
+    expected = robot.velocity(np.eye(robot.dof)) @ pull + np.abs(stiffness) * (q - rest)
     np.testing.assert_allclose(scene.holding_torque(q), expected, atol=1e-10)
     np.testing.assert_allclose(scene.holding_controls(q), expected, atol=1e-10)
 
@@ -104,63 +122,17 @@ def test_gravity_as_a_number_is_answered_with_the_vector_meant():
         vp.Scene(UR5, gravity=-9.81)
 
 
-def test_noise_costs_and_barriers_take_names():
-    named = vp.Scene(UR5, noise=vp.AdditiveNoise({"elbow_joint": 0.2}) + vp.StateNoise({"wrist_1_joint": 0.3}, POSE))
-    rows = vp.Scene(UR5, noise=vp.AdditiveNoise([0, 0, 0.2, 0, 0, 0]) + vp.StateNoise([0, 0, 0, 0.3, 0, 0], ROW))
-    options = {"dt": 2e-3, "steps": 10, "rng": 5}
-    moved = vp.simulate(named, ROW, np.zeros(6), **options)
-    assert same(moved, vp.simulate(rows, ROW, np.zeros(6), **options))
-    assert np.ptp(moved.q[:, 2]) > 0.0
-
-    weight = {"elbow_joint": 3.0, "wrist_1_joint": 1.0}
-    row = np.array([0, 0, 3.0, 1.0, 0, 0])
-
-    def value(cost):
-        problem = vp.OptimalControlProblem(vp.Scene(UR5), cost + vp.ControlCost(1.0), ROW, 0.5 * ROW, dt=0.01, steps=5)
-        return problem.cost_of(problem.simulate(np.ones(6)))
-
-    for by_name, by_row in (
-        (vp.TrackingCost(POSE, weight), vp.TrackingCost(ROW, row)),
-        (vp.VelocityCost(weight, {"wrist_3_joint": 0.1}), vp.VelocityCost(row, [0, 0, 0, 0, 0, 0.1])),
-        (vp.JointLimitBarrier(UR5, weight, {"elbow_joint": 2.5}), vp.JointLimitBarrier(UR5, row, [0, 0, 2.5, 0, 0, 0])),
-    ):
-        assert value(by_name) == value(by_row)
-    assert repr(vp.TrackingCost(0.0, weight)) == f"TrackingCost(weight={weight})"
-
-
-def test_controls_that_are_torques_of_joints_take_names():
-    """Whether all joints are driven or some, in another order."""
-    push, row = {"elbow_joint": 3.0, "wrist_1_joint": -1.0}, np.array([0, 0, 3.0, -1.0, 0, 0])
-    driven = ["wrist_1_joint", "elbow_joint", "wrist_3_joint"]
-    for actuation, controls in ((None, row), (driven, np.array([-1.0, 3.0, 0.0]))):
-        scene = vp.Scene(UR5, actuation=actuation, noise=vp.AdditiveNoise(0.1))
-        assert scene.control_joints == (NAMES if actuation is None else tuple(driven))
-        options = {"dt": 2e-3, "steps": 10}
-        by_row = vp.simulate(scene, ROW, np.zeros(6), controls=controls, **options)
-        assert same(vp.simulate(scene, ROW, np.zeros(6), controls=push, **options), by_row)
-        assert np.array_equal(by_row.u[4], controls)
-        (one,) = vp.simulate_ensemble(scene, ROW, np.zeros(6), controls=push, paths=1, rng=0, **options).u
-        assert np.array_equal(one, by_row.u)
-        weight, by_name = np.abs(controls), {joint: abs(value) for joint, value in push.items()}
-        for named, plain in (
-            (vp.ControlCost(by_name, push), vp.ControlCost(weight, controls)),
-            (
-                vp.ControlRateCost(by_name, push) + vp.ControlCost(),
-                vp.ControlRateCost(weight, controls) + vp.ControlCost(),
-            ),
-        ):
-            values = []
-            for cost in (named, plain):
-                problem = vp.OptimalControlProblem(scene, cost, ROW, 0.5 * ROW, **options)
-                values.append(problem.cost_of(problem.simulate(np.linspace(0, 1, scene.controls))))
-            assert values[0] == values[1] > 0.0
-        limits = ({"elbow_joint": -2.0}, {"elbow_joint": 2.5, "wrist_1_joint": np.inf})
-        problem = vp.OptimalControlProblem(scene, vp.ControlCost(), ROW, ROW, control_limits=limits, **options)
-        at = scene.control_joints.index("elbow_joint")
-        assert problem.control_limits[:, at].tolist() == [-2.0, 2.5]
-        assert np.isinf(np.delete(problem.control_limits, at, axis=1)).all()
-        start = vp.solve(problem, push, max_iterations=0, check=False)
-        np.testing.assert_array_equal(start.controls[3], np.clip(controls, *problem.control_limits))
+def test_torques_of_some_joints_in_another_order_take_names():
+    driven = ("wrist_1_joint", "elbow_joint", "wrist_3_joint")
+    scene = vp.Scene(UR5, actuation=list(driven))
+    assert (scene.control_joints, vp.Scene(UR5).control_joints) == (driven, NAMES)
+    named = motion(scene=scene, controls={"elbow_joint": 3.0, "wrist_1_joint": -1.0})
+    assert named.u[4].tolist() == [-1.0, 3.0, 0.0]
+    limits = ({"elbow_joint": -2.0}, {"elbow_joint": 2.5, "wrist_1_joint": np.inf})
+    task = problem(scene=scene, control_limits=limits)
+    assert task.control_limits.tolist() == [[-np.inf, -2.0, -np.inf], [np.inf, 2.5, np.inf]]
+    start = vp.solve(task, {"elbow_joint": 3.0}, max_iterations=0, check=False)
+    assert start.controls[3].tolist() == [0.0, 2.5, 0.0]
 
 
 USES = [

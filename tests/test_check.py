@@ -473,20 +473,6 @@ def test_findings(tmp_path):
 SLIDER = vp.Scene(slider(1.0), gravity=False)
 
 
-@pytest.mark.parametrize("method", [EULER, vp.Radau(1)], ids=str)
-def test_a_law_that_its_record_tells_acts_on_the_repetition(method):
-    scene, gains = vp.Scene(vp.planar_chain(1)), np.array([-20.0, -1.0])
-
-    def law(t, q, v):
-        return [gains @ [q[0], v[0]]]
-
-    motion = vp.simulate(scene, [1.0], [0.0], dt=0.04, steps=50, controls=law, integrator=method)
-    fine = vp.simulate(
-        scene, [1.0], [0.0], dt=0.0025, steps=800, controls=law, period=16, integrator=vp.Gauss(4), check=False
-    )
-    np.testing.assert_allclose(motion.error, np.abs(motion.q - fine.q[::16]), rtol=1e-2, atol=1e-6)
-
-
 def test_the_second_part_of_a_split_kick_has_the_field_at_the_end_of_its_step():
     scene = vp.Scene(vp.planar_chain(2), noise=vp.StateNoise(3.0, center=np.zeros(2)))
     kicked = vp.Gauss(5, kick="split")

@@ -195,7 +195,7 @@ def test_long_chains_fall_for_ten_seconds(links):
 def test_a_heavy_part_does_not_hide_a_light_one():
     """A slider of 1000 kg falls beside three links of 1 kg: the links' own energy is kept as if they were alone."""
     chain = vp.planar_chain(3)
-    model = chain.free_model.copy()
+    model = chain.model.copy()
     joint = model.addJoint(0, pin.JointModelPZ(), pin.SE3.Identity(), "slide")
     model.appendBodyToJoint(joint, pin.Inertia.FromSphere(1000.0, 0.1), pin.SE3.Identity())
     both = vp.Scene(vp.load_robot(model))

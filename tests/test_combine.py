@@ -54,14 +54,14 @@ def test_shapes_stand_where_the_parts_put_them(arms):
     shapes, missing = readable_geometry(both)
     assert not missing
     for shape in shapes.geometryObjects:
-        assert both.free_model.frames[shape.parentFrame].parentJoint == shape.parentJoint
+        assert both.model.frames[shape.parentFrame].parentJoint == shape.parentJoint
 
 
 def placed(robot, q):
     """Where the shapes of a robot are, by name."""
-    shapes, data = geometry(robot), robot.free_model.createData()
+    shapes, data = geometry(robot), robot.model.createData()
     of_shapes = shapes.createData()
-    pin.updateGeometryPlacements(robot.free_model, data, shapes, of_shapes, robot.free_positions(q))
+    pin.updateGeometryPlacements(robot.model, data, shapes, of_shapes, robot.configuration(q))
     return {shape.name: place.homogeneous for shape, place in zip(shapes.geometryObjects, of_shapes.oMg, strict=True)}
 
 

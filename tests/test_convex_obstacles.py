@@ -119,39 +119,6 @@ def around(obstacle, steps=30):
     return vp.OptimalControlProblem(vp.Scene(robot, damping=0.1), cost, [0.0, 0.0], np.zeros(2), **options)
 
 
-def test_a_plan_around_a_wedge():
-    """The plan without the wedge goes through it."""
-    wedge = vp.Obstacle.convex(WEDGE - [0.2, 0.15, 0.1], [1.75, 0.0, -0.85], TURN, "wedge")
-    problem = around(wedge)
-    direct = vp.solve(
-        vp.OptimalControlProblem(
-            problem.scene, problem.cost, problem.q0, problem.v0, dt=problem.dt, steps=problem.steps
-        )
-    )
-    measure = clearance(problem.scene.robot, [wedge], links=["joint2"], capsules=ARM)
-    assert measure.distances(direct.trajectory.q).min() < -0.05
-    plan = vp.solve(problem)
-    assert plan.status is vp.Status.CONVERGED
-    assert plan.violation <= 1e-6
-    assert measure.distances(plan.trajectory.q).min() == pytest.approx(0.02, abs=1e-6)
-
-
-def test_mesh_files(tmp_path):
-    """The hull of a mesh's vertices, scaled; the same obstacle as of its points."""
-    hull = vp.Obstacle.convex(1000.0 * WEDGE).hull
-    path = tmp_path / "wedge.obj"
-    corners = "".join(f"v {x} {y} {z}\n" for x, y, z in 1000.0 * WEDGE)
-    path.write_text(corners + "f 1 2 3\nf 2 4 3\nf 1 5 2\nf 3 4 6\nf 5 6 2\n")
-    read = vp.Obstacle.mesh(path, 0.001, [0.1, 0.2, 0.3], TURN)
-    own = vp.Obstacle.convex(WEDGE, [0.1, 0.2, 0.3], TURN)
-    assert read.name == "wedge"
-    assert len(hull.faces) == 8
-    np.testing.assert_allclose(read.begin, own.begin, atol=1e-7)
-    np.testing.assert_allclose(np.sort(read.hull.points, axis=0), np.sort(own.hull.points, axis=0), atol=1e-7)
-    with refused(vp.InputError, "scale"):
-        vp.Obstacle.mesh(path, -1.0)
-
-
 @pytest.mark.parametrize(
     ("given", "facts"),
     [
@@ -213,16 +180,6 @@ type = "convex"
 name = "other"
 points = [[1, 0, 1], [1.4, 0, 1], [1, 0.3, 1], [1, 0, 1.25], [1.1, 0.1, 1.1]]
 """
-
-
-def test_scene_files(tmp_path):
-    path = tmp_path / "arm.toml"
-    path.write_text(SCENE, encoding="utf-8")
-    (clear,) = vp.load_scene(path).problem.constraints
-    assert clear.pairs == ("wrist_3_link and convex", "wrist_3_link and other")
-    one, other = clear.obstacles
-    np.testing.assert_allclose(one.begin + one.hull.points.max(axis=0), [1.4, 0.3, 0.25])
-    assert len(other.hull.points) == 4
 
 
 def test_scene_files_take_meshes_and_srdf_files(tmp_path):

@@ -13,7 +13,6 @@ from test_sddp import SAMPLINGS, run, sliders, small
 
 import varpin as vp
 from varpin.control.costs import Points
-from varpin.core import CostTerms, Subject
 from varpin.model.kinematics import frame_kinematics
 
 N, CONTROLS = 7, 3
@@ -68,10 +67,10 @@ def slopes_in_q(function, q, step=1e-2):
 
 def masses(robot, q):
     """Centres of mass (N, 3) and their derivatives (N, 3, n), by Pinocchio."""
-    model, gear = robot.free_model, robot.free_velocities(np.eye(robot.dof)).T
+    model, gear = robot.model, robot.velocity(np.eye(robot.dof)).T
     data = model.createData()
-    slopes = np.array([pin.jacobianCenterOfMass(model, data, robot.free_positions(row)) @ gear for row in q])
-    return np.array([pin.centerOfMass(model, data, robot.free_positions(row)).copy() for row in q]), slopes
+    slopes = np.array([pin.jacobianCenterOfMass(model, data, robot.configuration(row)) @ gear for row in q])
+    return np.array([pin.centerOfMass(model, data, robot.configuration(row)).copy() for row in q]), slopes
 
 
 def terms(rng, robot, frame, q, v, u):
@@ -191,28 +190,6 @@ def test_manipulability_where_there_is_none(load):
     np.testing.assert_allclose(given.hessian[:, :6, :6], 2.0 * outer, atol=1e-9)
 
 
-def test_terms_of_what_is_not_there_are_refused(robot, frame):
-    """By the core, which the library does not ask for them."""
-    n = robot.dof
-    costs, kinematics = CostTerms.make(n, 2), frame_kinematics(robot, frame)
-    costs.add_frame(kinematics.links.core, kinematics.rotation, kinematics.translation)
-    center = costs.add_center(kinematics.links.core)
-    for fact, subject, place, size, target, directions in (
-        ("do not exist", Subject.entries, 2 * n, 3, (1, 3), []),
-        ("do not exist", Subject.excess, 2 * n, 3, (1, 6), []),
-        ("do not exist", Subject.position, 2, 3, (1, 3), []),
-        ("wrong size", Subject.twist, 0, 3, (1, 3), []),
-        ("target has size 3", Subject.orientation, 0, 3, (1, 3), []),
-        ("no target", Subject.position, 0, 3, (0, 3), []),
-        ("has directions", Subject.manipulability, 0, 1, (1, 1), []),
-        ("has directions", Subject.position, 0, 3, (1, 3), [0]),
-        ("rows of a Jacobian", Subject.manipulability, 0, 1, (1, 1), [6]),
-        ("only a position", Subject.twist, center, 6, (1, 6), []),
-    ):
-        with refused(ValueError, fact):
-            costs.add_term(subject, place, np.eye(size), np.zeros(target), np.array(directions, dtype=np.int64))
-
-
 def tree(seed):
     """A random tree with a frame set apart on its deepest joint."""
     model = mechanisms.random_tree(seed)
@@ -225,8 +202,8 @@ def tree(seed):
 
 def pinocchio_frame(robot, frame, q, v):
     """Rotation, position and twist (6,) in world axes, joint by joint in Pinocchio."""
-    model, data = robot.free_model, robot.free_model.createData()
-    pin.forwardKinematics(model, data, robot.free_positions(q), robot.free_velocities(v))
+    model, data = robot.model, robot.model.createData()
+    pin.forwardKinematics(model, data, robot.configuration(q), robot.velocity(v))
     pin.updateFramePlacements(model, data)
     index = model.getFrameId(frame)
     placed = data.oMf[index]
@@ -241,14 +218,14 @@ def test_frames(load, rng, name):
     q, v, _ = samples(rng, robot)
     kinematics = frame_kinematics(robot, frame)
     R, p, J = kinematics.jacobians(q)
-    gear = robot.free_velocities(np.eye(robot.dof)).T
-    model, data, index = robot.free_model, robot.free_model.createData(), robot.free_model.getFrameId(frame)
+    gear = robot.velocity(np.eye(robot.dof)).T
+    model, data, index = robot.model, robot.model.createData(), robot.model.getFrameId(frame)
     for k in range(N):
         rotation, position, twist = pinocchio_frame(robot, frame, q[k], v[k])
         np.testing.assert_allclose(R[k], rotation, atol=1e-13)
         np.testing.assert_allclose(p[k], position, atol=1e-13)
         np.testing.assert_allclose(J[k] @ v[k], twist, atol=1e-12)
-        whole = pin.computeFrameJacobian(model, data, robot.free_positions(q[k]), index, WORLD)
+        whole = pin.computeFrameJacobian(model, data, robot.configuration(q[k]), index, WORLD)
         np.testing.assert_allclose(J[k], whole @ gear, atol=1e-13)
     for placed, once_more in zip(kinematics.placements(q), (R, p), strict=True):
         np.testing.assert_array_equal(placed, once_more)

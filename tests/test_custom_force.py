@@ -89,27 +89,6 @@ def test_shown():
     assert repr(vp.CustomForce(drag, "complex")) == "CustomForce(drag, derivatives by complex steps)"
 
 
-@pytest.mark.parametrize("most", [0.2, 0.4])
-def test_all_steps_before_a_function_that_raises_are_kept_under_linear_controls(most):
-    def drag(q, v):
-        if abs(v[0]) > most:
-            raise ValueError("beyond the table")
-        return -0.1 * v
-
-    scene = vp.Scene(vp.planar_chain(1), forces=[vp.CustomForce(drag)])
-    given = np.zeros((9, 1)), np.zeros((9, 1, 2)), np.zeros((9, 2))
-    policy = vp.LinearPolicy(*given, linear=True, before=[0.0])
-    with refused(vp.ForceError, "beyond the table") as caught:
-        vp.simulate(scene, [0.3], [0.0], dt=0.01, steps=9, controls=policy)
-    error = caught.value
-    held = [np.zeros((error.step + more, 1)) for more in (0, 1)]
-    assert (
-        vp.simulate(scene, [0.3], [0.0], dt=0.01, steps=error.step, controls=held[0], check=False).steps == error.step
-    )
-    with refused(vp.ForceError, "beyond the table"):
-        vp.simulate(scene, [0.3], [0.0], dt=0.01, steps=error.step + 1, controls=held[1], check=False)
-
-
 def test_a_function_that_raises_in_the_check_leaves_the_motion():
     def drag(q, v):
         if abs(v[1]) > 4.6:

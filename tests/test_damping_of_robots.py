@@ -60,9 +60,9 @@ def test_the_description_s_dampers_take_what_pinocchio_s_model_says(arm, caplog)
     assert "friction='robot'" in sentence
     assert "N m s/rad" not in sentence
     v = np.array([0.7, -1.3])
-    free = robot.free_velocities(v)
-    assert scene.damping @ v**2 == pytest.approx(np.asarray(robot.free_model.damping) @ free**2, rel=1e-14)
-    assert robot.friction @ np.abs(v) == pytest.approx(np.asarray(robot.free_model.friction) @ np.abs(free), rel=1e-14)
+    free = robot.velocity(v)
+    assert scene.damping @ v**2 == pytest.approx(np.asarray(robot.model.damping) @ free**2, rel=1e-14)
+    assert robot.friction @ np.abs(v) == pytest.approx(np.asarray(robot.model.friction) @ np.abs(free), rel=1e-14)
     # And it is what forces of that size do in the equations of motion.
     given = vp.Scene(robot, damping=[0.3, 0.5 + 4 * 0.25])
     ends = [vp.simulate(s, [0.1, 0.2], v, dt=1e-3, steps=20).q for s in (scene, given)]

@@ -35,6 +35,20 @@ def test_a_start_in_degrees(scene, capsys):
     assert not unnamed(" ".join(capsys.readouterr().err.split()), FACTS)
 
 
+@pytest.mark.parametrize(
+    ("speed", "told"), [(90.0, True), (-22.5, True), (22.51234, False), (3.1, False), (12.5, False)]
+)
+def test_a_speed_beyond_its_limit_in_degrees(scene, speed, told):
+    v0 = np.array([0.0, speed, 0.0, 0.0, 0.0, 0.0])
+    warnings = vp.simulate(scene, np.zeros(6), v0, dt=1e-4, steps=2).warnings
+    found = [warning for warning in warnings if "looks like degrees" in warning]
+    assert [not unnamed(text, "v0", "'shoulder_lift_joint'", f"{speed:g} rad/s") for text in found] == [True] * told
+    free = scene.robot.model.copy()
+    free.velocityLimit = np.full(6, np.inf)
+    motion = vp.simulate(vp.Scene(vp.load_robot(free)), np.zeros(6), v0, dt=1e-4, steps=2)
+    assert not any("looks like degrees" in warning for warning in motion.warnings)
+
+
 def test_positions_for_servos_in_degrees(scene):
     servos = vp.Scene(scene.robot, gravity=False, damping=1.0, forces=[vp.PositionServo(100.0, 10.0)])
     task = {"q0": np.zeros(6), "v0": np.zeros(6), "dt": 1e-3, "steps": 2}
@@ -105,7 +119,7 @@ def test_stops_in_degrees(caplog):
     assert not caplog.records
     vp.Scene(robot, forces=[vp.JointStop(1e3, 5.0, lower=-90.0, upper=90.0)])
     told = [record.getMessage() for record in caplog.records]
-    assert [sentence.partition(" of the JointStop")[0] for sentence in told] == ["the lower end", "the upper end"]
+    assert [sentence.partition(" of the JointStop")[0] for sentence in told] == ["lower", "upper"]
     assert all("looks like degrees" in sentence for sentence in told)
 
 

@@ -73,7 +73,7 @@ def test_the_word_stands_among_others(looped, caplog):
     assert not caplog.records
     assert not vp.Scene(vp.load_robot("finger"), constraints="robot").constraints
     assert not unnamed(caplog.records[0].getMessage(), "constraints='robot'", "none")
-    for given, facts in (("file", "constraints"), (["file"], "'file'")):
+    for given, facts in (("file", "constraints"), (["file"], "'file'"), (["robot", "robot"], "twice")):
         with refused(vp.InputError, facts):
             vp.Scene(looped, constraints=given)
 

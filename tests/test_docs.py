@@ -20,6 +20,7 @@ import page_code
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
+README = "../README.md"
 # What pages write for the browser, and the package beside varpin's own that they are about.
 MADE = {
     "tutorial.md": ["panda_reach.html"],
@@ -175,19 +176,6 @@ def test_an_equation_is_computed_where_the_map_says(numbers, functions):
 
 
 HEADERS = sorted((ROOT / "src" / "core").rglob("*.hpp"))
-NAMED_PAGE = re.compile(r"docs/([\w-]+\.md)((?:(?:,| and)? \"[^\"]+\")*)")
-
-
-@pytest.mark.parametrize("header", HEADERS, ids=lambda path: path.name)
-def test_a_header_names_a_page_at_its_head(header):
-    """And sections of it that there are: headings, or words in bold at the beginning of a paragraph."""
-    head = header.read_text(encoding="utf-8").partition("#pragma once")[0]
-    named = NAMED_PAGE.findall(re.sub(r"\s*\n// *", " ", head))
-    assert named, f"{header.name} names no page of docs/"
-    for page, sections in named:
-        assert page in PAGES
-        for section in re.findall(r'"([^"]+)"', sections):
-            assert re.search(rf"^(?:#+ |\*\*){section}\b", text_of(page), re.M), f"{page} has no section {section!r}"
 
 
 def test_every_header_of_the_core_is_on_its_map():
@@ -220,7 +208,7 @@ def test_type_checkers_see_the_names_that_are_imported_late():
     assert seen == {(module, name) for module, names in vp._LATE.items() for name in names.split()}
 
 
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize("page", [README, *PAGES])
 def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#:]+)[)#]", text_of(page)):
         assert ((DOCS / page).parent / target).exists(), target

@@ -27,21 +27,6 @@ def test_cosines_of_any_angle():
     np.testing.assert_allclose(found, expected.astype(float), rtol=4e-16, atol=1e-16 * abs(largest))
 
 
-def test_friction_and_what_it_leaves_of_a_peak():
-    scene = vp.Scene(
-        vp.planar_chain(1),
-        gravity=False,
-        forces=[vp.CoulombFriction(0.7, breakaway=0.9, stribeck_velocity=0.3, width=0.1)],
-    )
-    v = np.concatenate([np.linspace(-3.0, 3.0, 61), [1e-9, 0.0625, 0.0624]])
-    M = vp.lagrangian_jet(scene, [0.0], [0.0]).Lvv[0, 0]
-    dt = 1e-7
-    steps = [vp.simulate(scene, [0.0], [w], dt=dt, steps=1, integrator=vp.RungeKutta4(), check=False) for w in v]
-    found = np.array([M * (motion.v[1, 0] - motion.v[0, 0]) / dt for motion in steps])
-    expected = -(0.7 + 0.2 * np.exp(-((v / 0.3) ** 2))) * np.tanh(v / 0.1)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
-
-
 RUN = """
 import hashlib
 import numpy as np

@@ -142,9 +142,9 @@ def test_accelerations_are_pinocchios(robot):
     """The change of velocity over a step of Euler's method."""
     scene, (q, v), u = vp.Scene(robot, damping=0.0, friction=0.0), state_of(robot), np.cos(np.arange(robot.dof))
     motion = vp.simulate(scene, q, v, dt=H, steps=1, controls=u, integrator=vp.ExplicitEuler(), check=False)
-    data, at, rates = robot.free_model.createData(), robot.free_positions(q), robot.free_velocities(v)
+    data, at, rates = robot.model.createData(), robot.configuration(q), robot.velocity(v)
     M = jet_of(scene, q, v).Lvv
-    force = u - robot.free_velocities(np.eye(robot.dof)) @ pin.nonLinearEffects(robot.free_model, data, at, rates)
+    force = u - robot.velocity(np.eye(robot.dof)) @ pin.nonLinearEffects(robot.model, data, at, rates)
     assert np.array_equal(motion.q[1], q + H * v)
     left = M @ ((motion.v[1] - v) / H) - force
     assert np.abs(left).max() <= 1e-9 * (np.abs(M) @ np.abs(np.linalg.solve(M, force))).max()

@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 from findings import about
 from naive import gradient
-from refusals import refused, unnamed
+from oracles import slope
+from refusals import naming, refused, unnamed
 
 import varpin as vp
 from varpin.core.arrays import Element
-
-WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}  # of eighth-order central differences
 
 
 def rise(y):
@@ -85,14 +84,11 @@ def test_each_against_its_formula(given, element):
         def potential(x):
             return energy(element, x[..., 0])
 
-        slope = gradient(potential, at)
+        pull = gradient(potential, at)
         assert pytest.approx(energy(element, q), rel=1e-12, abs=1e-13) == other.L - own.L
-        assert own.Lq - other.Lq == pytest.approx(-slope, rel=1e-12, abs=1e-13)
-        h = 1e-4
-        curvature = sum(
-            w * (gradient(potential, at + i * h) - gradient(potential, at - i * h)) for i, w in WEIGHTS.items()
-        )
-        assert own.Lqq[0] - other.Lqq[0] == pytest.approx(-curvature / h, rel=1e-9, abs=1e-9)
+        assert own.Lq - other.Lq == pytest.approx(-pull, rel=1e-12, abs=1e-13)
+        curvature = slope(lambda x: gradient(potential, x), at, np.ones(1), 1e-4)
+        assert own.Lqq[0] - other.Lqq[0] == pytest.approx(-curvature, rel=1e-9, abs=1e-9)
         value, by_q, by_v, lost = (array[0] for array in scene.core.forces(at[None], rate[None], np.array([[0.7]])))
         assert value == pytest.approx([force(element, q, v, 0.7)], rel=1e-13, abs=1e-15)
         assert by_q == pytest.approx(
@@ -175,6 +171,7 @@ def test_scenes_show_their_forces():
     ("force", "facts"),
     [
         (vp.JointDamper(-1.0), ("damping[0]", "-1.0", "0")),
+        (vp.JointDamper(None), ("damping", "None")),
         (vp.Armature([1.0, 2.0]), ("inertia", "(6,)")),
         (vp.CoulombFriction(1.0, width=0.0), ("width[0]", "0.0", "0")),
         (vp.CoulombFriction(1.0, breakaway=2.0), ("breakaway", "stribeck_velocity")),
@@ -189,30 +186,6 @@ def test_scenes_show_their_forces():
 def test_what_is_no_force_is_refused(force, facts):
     with refused(vp.InputError, facts):
         vp.Scene(vp.load_robot("ur5"), forces=force)
-
-
-def test_a_joint_that_the_robot_does_not_have_is_named():
-    with refused(vp.UnknownJoint, "stiffness", "'knee'", "elbow_joint"):
-        vp.Scene(vp.load_robot("ur5"), forces=vp.JointSpring({"knee": 1.0}))
-
-
-def test_what_friction_lets_a_motion_do_is_linearized():
-    """Friction that turns round within a step: a motion's root is far from what its nodes say of it."""
-    robot = vp.load_robot("z1")
-    scene = vp.Scene(robot, damping="robot", forces=[vp.CoulombFriction(robot.friction, width=0.1)])
-    rng, n, t = np.random.default_rng(0), robot.dof, 0.02 * np.arange(50)[:, None]
-    for _ in range(3):
-        q0 = rng.uniform(-0.5, 0.5, n)
-        waves = np.sin(2.0 * np.pi * rng.uniform(0.5, 3.0, n) * t + rng.uniform(0.0, 6.0, n))
-        u = scene.holding_torque(q0) + rng.uniform(0.5, 3.0, n) * waves
-        motion = vp.simulate(scene, q0, np.zeros(n), dt=0.02, steps=50, controls=u, check=False)
-        assert np.isfinite(vp.linearize(scene, motion).A).all()
-
-
-@pytest.mark.parametrize("force", [vp.JointSpring, vp.JointDamper, vp.PositionServo, vp.CoulombFriction, vp.Armature])
-def test_a_force_without_its_number_is_refused(force):
-    with refused(vp.InputError, "None"):
-        vp.Scene(vp.planar_chain(2), forces=force(None))
 
 
 def test_stops_ends_and_servos_are_said():
@@ -245,4 +218,43 @@ def test_limits_are_held_against_what_drives_and_stops_do():
     loose = vp.Scene(robot, gravity=False, forces=[vp.JointStop(1e3, lower=-50, upper=50)])
     assert about(said(loose, [0, 0, 2.9, 0, 0, 0], [0, 0, 6.0, 0, 0, 0], 400), "position limits")
     stiff = vp.Scene(robot, gravity=False, forces=[vp.JointStop(1e5, 1e3)])
-    assert not about(said(stiff, [0, 0, 3.0, 0, 0, 0], [0, 0, 1.0, 0, 0, 0], 400), "position limits")
+    for side in (1.0, -1.0):
+        assert not about(said(stiff, [0, 0, 3.0 * side, 0, 0, 0], [0, 0, side, 0, 0, 0], 400), "position limits")
+
+
+REST = [0.0, -1.0, 1.0, -0.5, 0.8, 0.0]
+
+
+@pytest.fixture(scope="module")
+def served():
+    scene = vp.Scene(vp.load_robot("ur5"), forces=[vp.PositionServo(2000.0, 200.0)])
+    return scene, vp.simulate(scene, REST, np.zeros(6), dt=1e-3, steps=200, integrator=vp.Radau(3))
+
+
+def test_servos_that_are_told_nothing_stay(served):
+    scene, motion = served
+    np.testing.assert_array_equal(motion.u, np.tile(REST, (200, 1)))
+    # They give way to gravity alone, by what a spring would.
+    sag = scene.holding_torque(REST) / 2000.0
+    assert np.abs(motion.q - REST).max() < 2.0 * np.abs(sag).max()
+
+
+def test_ensembles_and_advice_take_the_same(served):
+    scene, motion = served
+    paths = vp.simulate_ensemble(scene, REST, np.zeros(6), dt=1e-3, steps=200, paths=1, rng=0, integrator=vp.Radau(3))
+    np.testing.assert_allclose(paths.statistics.mean[-1, :6], motion.q[-1], rtol=0, atol=1e-12)
+    with refused(vp.InputError, "controls", "servos"):
+        vp.simulate_ensemble(scene, [REST, np.zeros(6)], np.zeros(6), dt=1e-3, steps=2, paths=2, rng=0)
+
+
+def test_commands_are_not_coloured_as_torques(served, tmp_path):
+    scene, motion = served
+    with refused(vp.InputError, "controls", "servos"):
+        vp.replay(scene.robot, motion, html=tmp_path / "served.html", marks=vp.Marks(torques=True))
+
+
+def test_gravity_in_millimetres_is_told(caplog):
+    vp.Scene(vp.planar_chain(1), gravity=[0.0, 0.0, -24.8])
+    assert not caplog.messages
+    vp.Scene(vp.planar_chain(1), gravity=[0.0, 0.0, -9810.0])
+    assert len(naming(caplog.messages, "gravity", "-9810.0", "mm/s^2")) == 1

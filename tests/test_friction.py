@@ -59,24 +59,6 @@ def test_stick_slip_of_one_joint():
     assert own(motion) == []
 
 
-def test_an_arm_comes_to_rest():
-    """All joints of an arm under friction that holds it, against SciPy; its energy never rises on the way."""
-    robot = vp.load_robot("ur5")
-    scene = vp.Scene(robot, gravity=False, forces=vp.CoulombFriction([8.0, 8.0, 5.0, 2.0, 2.0, 1.0], 1e-2))
-    begin, speed = np.array([0.0, -1.2, 1.5, -0.5, 0.3, 0.2]), np.array([1.0, 1.0, -1.0, 1.0, 2.0, 2.0])
-
-    def slope(_, x):
-        return np.concatenate([x[6:], accelerations(scene, x[:6], x[6:], np.zeros(6))])
-
-    times = np.linspace(0.0, 0.6, 13)
-    exact = solve_ivp(slope, (0.0, 0.6), np.append(begin, speed), "Radau", t_eval=times, rtol=1e-8, atol=1e-10).y.T
-    for integrator, error in ((vp.Radau(3), 2e-6), (vp.Gauss(3), 2e-6), (vp.Midpoint(), 2e-5)):
-        motion = vp.simulate(scene, begin, speed, dt=1e-3, steps=600, integrator=integrator)
-        np.testing.assert_allclose(motion.q[::50], exact[:, :6], atol=error)
-        assert np.abs(motion.v[-1]).max() < 1e-6
-        assert np.diff(motion.energy).max() <= 1e-12 * motion.energy[0]
-
-
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.Gauss(4), vp.Radau(2), vp.Radau(3)], ids=str)
 @pytest.mark.parametrize("width", [1e-1, 1e-3, 1e-5])
 def test_friction_never_adds_energy(integrator, width):
@@ -126,26 +108,6 @@ def test_problems_take_an_integrator_that_friction_is_not_too_fast_for():
         rough.scene, rough.cost, rough.q0, rough.v0, dt=0.02, steps=30, integrator=vp.Gauss(2)
     )
     assert given.integrator == vp.Gauss(2)
-
-
-@pytest.mark.parametrize(
-    ("fast", "taken", "other"), [(5.0, vp.Gauss(4), vp.Radau(4)), (12.0, vp.Radau(4), vp.Gauss(4))]
-)
-def test_plans_of_damped_arms_hold_better_by_the_integrator_that_problems_take(fast, taken, other):
-    """``fast`` is the rate of the fastest damper times the step."""
-    free = vp.Scene(vp.planar_chain(2))
-    begin, rest = np.array([-1.0, 0.5]), np.zeros(2)
-    rate = np.abs(np.linalg.eigvals(np.linalg.inv(vp.lagrangian_jet(free, begin, rest).Lvv))).max()
-    scene = vp.Scene(vp.planar_chain(2), damping=fast / 0.05 / rate)
-    cost = vp.ControlCost(1e-4) + vp.VelocityCost(1.0)
-    cost += vp.Terminal(vp.TrackingCost([0.0, 0.3], 1e4) + vp.VelocityCost(1e3))
-    problem = vp.OptimalControlProblem(scene, cost, begin, rest, dt=0.05, steps=20)
-    assert problem.integrator == taken
-    losses = [
-        abs(vp.solve(at, check=False).verify(tolerance=1e-3).open_loop_loss)
-        for at in (problem, problem.at(integrator=other))
-    ]
-    assert losses[0] < 0.5 * losses[1]
 
 
 def test_verification_under_friction_that_is_too_fast_for_explicit_steps():

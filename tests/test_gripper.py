@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from findings import about
 from refusals import naming, unnamed
-from scipy.integrate import solve_ivp
 
 import varpin as vp
 
@@ -36,29 +35,6 @@ def test_the_loops_are_closed_wherever_the_crank_is(task):
     ends = {side: task.robot.frame_positions(np.zeros((1, 6)), f"{side}_pad")[0] for side in ("right", "left")}
     np.testing.assert_allclose(ends["right"] * [-1.0, 1.0, 1.0], ends["left"], atol=1e-15)
     assert ends["right"][0] - ends["left"][0] == pytest.approx(0.0854, abs=1e-12)
-
-
-def test_a_motion_is_that_of_the_crank_alone(task):
-    """One equation is left, s'M s a = s'(L_q - L_qv v - damping) + u, which DOP853 integrates."""
-    way, free = shares(task.robot), vp.Scene(task.robot, gravity=False)
-    damping = way @ np.diag(task.scene.damping) @ way
-
-    def dynamics(t, x):
-        jet = vp.lagrangian_jet(free, x[0] * way, x[1] * way)
-        pull = way @ (jet.Lq - jet.Lvq @ (x[1] * way)) - damping * x[1] + 0.4 * np.cos(8.0 * t)
-        return [x[1], pull / (way @ jet.Lvv @ way)]
-
-    truth = solve_ivp(dynamics, (0.0, 0.4), [0.2, 0.0], "DOP853", rtol=1e-12, atol=1e-13, t_eval=[0.2, 0.4]).y[0]
-    errors = []
-    for steps in (20, 40):
-        push = vp.OpenLoop(lambda t: [0.4 * np.cos(8.0 * t)])
-        motion = vp.simulate(
-            task.scene, 0.2 * way, np.zeros(6), dt=0.4 / steps, steps=steps, controls=push, integrator=vp.Gauss(2)
-        )
-        np.testing.assert_allclose(motion.q, motion.q[:, :1] * way * way[0], atol=1e-13)
-        errors.append(np.abs(motion.q[[steps // 2, -1], task.robot.coordinate("right_crank")] - truth).max())
-    assert errors[1] < 1e-7
-    assert 12.0 < errors[0] / errors[1] < 20.0
 
 
 def test_the_plan_closes_it_to_forty_millimetres(task):

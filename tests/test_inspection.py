@@ -151,7 +151,9 @@ def test_largest_step_of_a_pendulum_standing_up_and_hanging_down(tmp_path):
 
 def test_loaded_robot_is_taken_and_not_loaded_otherwise():
     robot = vp.planar_chain(2)
-    assert inspect_robot(robot).robot is robot
+    assert inspect_robot(robot).robot is inspect_robot(robot, lock=None).robot is robot
+    with pytest.raises(TypeError, match="unexpected keyword argument 'lokc'"):
+        inspect_robot("ur5", lokc={})
     with refused(vp.InputError, "lock"):
         inspect_robot(robot, lock={"joint1": 0.0})
 
@@ -175,7 +177,7 @@ def test_frames_are_listed_with_what_carries_them():
     """Each by a name that varpin finds; the chain of parents ends at the world, and passes the joint that moves it."""
     robot = vp.load_robot("ur5")
     report = inspect_robot(robot)
-    model = robot.free_model
+    model = robot.model
     assert [frame.name for frame in report.frames] == [frame.name for frame in list(model.frames)[1:]]
     frames = {frame.name: frame for frame in report.frames}
     q = np.zeros((1, 6))

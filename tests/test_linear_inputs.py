@@ -117,3 +117,16 @@ def test_noise_of_the_position_of_an_input_is_differentiated_at_the_end_of_the_s
         expected = lin.J[0] @ (fields[0] - fields[1]) / (2.0 * step)
         found = (lin.Gramp if c >= 3 else lin.Gu - lin.Gramp)[0, :, :, c % 3]
         np.testing.assert_allclose(found, expected, atol=1e-8)
+
+
+@pytest.mark.parametrize(("interpolation", "least"), [("linear", 0.309358), ("cubic", 0.373650)])
+def test_speeds_hold_between_nodes(interpolation: str, least: float) -> None:
+    """A hand may jump in velocity at a node, and with it the joints after it; to the least cost known."""
+    problem = hand_and_motor(interpolation)
+    within = vp.WithinVelocityLimits(problem.scene.robot, (-1.7, 1.7))
+    plan = vp.solve(hand_and_motor(interpolation, constraints=[within], between_nodes=True), check=False)
+    assert plan.status is vp.Status.CONVERGED
+    assert plan.iterations <= 30
+    assert plan.violation <= 1e-6
+    assert plan.cost == pytest.approx(least, rel=1e-3)
+    assert plan.verify().constraints[0].closed_loop < 4e-3

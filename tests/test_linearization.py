@@ -2,38 +2,11 @@
 
 import numpy as np
 import pytest
+from oracles import slope
 from refusals import refused
 
 import varpin as vp
 from varpin.linearization import linearize_steps
-
-WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
-
-
-def one_step(scene, x, u, dw, dt, integrator):
-    """The step (q, p, u, dw) -> (q', p') through the public interface."""
-    n = scene.robot.dof
-    q, p = x[:n], x[n:]
-    v = np.linalg.solve(vp.lagrangian_jet(scene, q, np.zeros(n)).Lvv, p)
-    end = vp.simulate(scene, q, v, dt=dt, steps=1, controls=u, increments=dw[None], integrator=integrator, check=False)
-    assert end.statistics.split_steps == 0
-    return np.concatenate([end.q[1], end.p[1]])
-
-
-def difference(function, x, size):
-    """Derivative of ``function`` at x by differences of eighth order, steps in proportion to ``size``."""
-    columns = []
-    for j in range(x.size):
-        e = np.zeros(x.size)
-        e[j] = size[j]
-        columns.append(sum(c * (function(x + k * e) - function(x - k * e)) for k, c in WEIGHTS.items()) / size[j])
-    return np.array(columns).T
-
-
-def worst(given, expected, rows, columns):
-    """Largest error, each entry in units of its row and column: positions and momenta differ by orders of magnitude."""
-    scaled = expected / rows[:, None] * columns[None, :]
-    return np.abs((given - expected) / rows[:, None] * columns[None, :]).max() / np.abs(scaled).max()
 
 
 def friction_noise(n, strength):
@@ -54,59 +27,31 @@ def friction_noise(n, strength):
 
 
 def test_velocity_dependent_fields():
-    """Their drift enters A and B; their derivatives at fixed momentum enter Gx."""
-    robot = vp.load_robot("ur5")
-    scene = vp.Scene(robot, damping=0.1, noise=friction_noise(6, 0.3))
-    rng = np.random.default_rng(0)
-    q, v, u, dt = rng.uniform(-1, 1, 6), rng.uniform(-1, 1, 6), rng.normal(size=6), 1e-3
-    integrator = vp.Midpoint()
-    motion = vp.simulate(scene, q, v, dt=dt, steps=1, controls=u, integrator=integrator)
-    lin = vp.linearize(scene, motion)
-    x, zero = np.concatenate([q, motion.p[0]]), np.zeros(6)
-    rows = np.concatenate([np.ones(6), np.full(6, np.abs(motion.p).max())])
-    in_x = difference(lambda x: one_step(scene, x, u, zero, dt, integrator), x, 5e-3 * rows)
-    assert worst(lin.A[0], in_x, rows, rows) < 1e-8
-    without_drift = vp.linearize(vp.Scene(robot, damping=0.1, noise=vp.AdditiveNoise(1.0)), motion)
-    assert worst(without_drift.A[0], in_x, rows, rows) > 1e-6
+    """Their drift enters A, and no scene without it; their derivatives at fixed momentum enter Gx."""
+    noises = friction_noise(6, 0.3), vp.AdditiveNoise(1.0)
+    noisy, plain = (vp.Scene(vp.load_robot("ur5"), damping=0.1, noise=noise) for noise in noises)
+    q, v, u, e, other = np.random.default_rng(0).uniform(-1, 1, (5, 6))
+    run = {"dt": 1e-3, "steps": 1, "controls": u, "integrator": vp.Midpoint(), "check": False}
+    motion = vp.simulate(noisy, q, v, increments=0, **run)
+    lin, p = vp.linearize(noisy, motion), motion.p[0]
+    along = np.append(e, np.abs(p).max() * other)
+
+    def speed(x):
+        return np.linalg.solve(vp.lagrangian_jet(plain, x[:6], np.zeros(6)).Lvv, x[6:])
+
+    def end(x):
+        moved = vp.simulate(noisy, x[:6], speed(x), increments=0, **run)
+        return np.append(moved.q[1], moved.p[1])
 
     def field(x):
-        v = np.linalg.solve(vp.lagrangian_jet(scene, x[:6], np.zeros(6)).Lvv, x[6:])
-        return (lin.K[0] @ scene.noise.fields(x[None, :6], v[None], u[None], q).F[0]).ravel()
+        return lin.K[0] @ noisy.noise.fields(x[None, :6], speed(x)[None], u[None], q).F[0]
 
-    in_fields = difference(field, x, 1e-2 * rows).reshape(12, 6, 12)
-    np.testing.assert_allclose(lin.Gx[0], in_fields, rtol=0, atol=1e-8 * np.abs(in_fields).max())
-
-
-@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4()], ids=str)
-def test_a_kick_leaves_the_drift_as_it_is(integrator):
-    """K is what a kick does; dx1/dp0 has the drift's derivative too, and is in A."""
-    plain = vp.Scene(vp.load_robot("ur5"), damping=0.1)
-    noisy = vp.Scene(plain.robot, damping=0.1, noise=friction_noise(6, 0.3))
-    q, v, u = np.random.default_rng(0).uniform(-1, 1, (3, 6))
-    M = vp.lagrangian_jet(plain, q, v).Lvv
-    for scene in (plain, noisy):
-        motion = vp.simulate(scene, q, v, dt=1e-3, steps=1, controls=u, integrator=integrator)
-        lin = vp.linearize(scene, motion)
-        in_p = lin.A[0][:, 6:] if integrator.variational else lin.A[0][:, 6:] @ np.linalg.inv(M)
-        off = np.abs(lin.K[0] - in_p).max() / np.abs(in_p).max()
-        assert off < 1e-9 if scene is plain else off > 1e-7
-    # Differences in the increment of one process, whose kick is F dw, with the drift of the state before it.
-    eighth = (
-        sum(
-            c * (_kicked(noisy, q, v, u, k, integrator) - _kicked(noisy, q, v, u, -k, integrator))
-            for k, c in WEIGHTS.items()
-        )
-        / 1e-3
-    )
-    np.testing.assert_allclose(lin.K[0] @ lin.F[0, :, 0], eighth, rtol=0, atol=1e-8 * np.abs(eighth).max())
-
-
-def _kicked(scene, q, v, u, k, integrator):
-    """Where a step ends whose first process has an increment of k thousandths."""
-    dw = np.zeros((1, 6))
-    dw[0, 0] = 1e-3 * k
-    end = vp.simulate(scene, q, v, dt=1e-3, steps=1, controls=u, increments=dw, integrator=integrator)
-    return np.concatenate([end.q[1], end.p[1] if integrator.variational else end.v[1]])
+    units, x = np.append(np.ones(6), np.full(6, np.abs(p).max())), np.append(q, p)
+    found = slope(end, x, along, 5e-3) / units
+    np.testing.assert_allclose(lin.A[0] @ along / units, found, rtol=0, atol=1e-8)
+    assert np.abs(vp.linearize(plain, motion).A[0] @ along / units - found).max() > 1e-6
+    found = slope(field, x, along, 1e-2)
+    np.testing.assert_allclose(lin.Gx[0] @ along, found, rtol=0, atol=1e-8 * np.abs(found).max())
 
 
 @pytest.mark.parametrize("speed", [0.0, 1.0, 5.0])

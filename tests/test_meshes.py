@@ -231,7 +231,7 @@ def test_a_box_is_a_box_in_every_file(tmp_path, caplog, name):
     (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     path = arm(tmp_path, name, scale)
     robot = vp.load_robot(path, inertia="meshes")
-    body = robot.free_model.inertias[2]
+    body = robot.model.inertias[2]
     assert body.mass == pytest.approx(6.0, rel=1e-6)
     np.testing.assert_allclose(body.lever, 0.5 * SIDES, atol=1e-7)
     moments = 6.0 / 12.0 * ((SIDES**2).sum() - SIDES**2)
@@ -241,7 +241,9 @@ def test_a_box_is_a_box_in_every_file(tmp_path, caplog, name):
     assert radius == pytest.approx(np.hypot(0.05, 0.1), rel=1e-6)
     np.testing.assert_allclose(np.mean([begin, end], axis=0), 0.5 * SIDES, atol=1e-7)
     if scale == "1 1 1":
-        np.testing.assert_allclose(vp.Obstacle.mesh(tmp_path / name).hull.sides, SIDES, rtol=1e-6)
+        obstacle = vp.Obstacle.mesh(tmp_path / name, 2.0, [1.0, 2.0, 3.0])
+        np.testing.assert_allclose(obstacle.hull.sides, 2.0 * SIDES, rtol=1e-6)
+        np.testing.assert_allclose(obstacle.begin - [1.0, 2.0, 3.0], SIDES, rtol=1e-6)
     # A model that Pinocchio has read the meshes of, as coal does.
     model = pin.buildModelFromUrdf(str(path))
     model.appendBodyToJoint(2, pin.Inertia.Random(), pin.SE3.Identity())
@@ -298,6 +300,17 @@ def test_what_is_no_mesh_is_named_with_its_cause(tmp_path, name, content, facts)
         vp.Obstacle.mesh(tmp_path / name)
     with refused(vp.RobotError, ("'l2'", *facts)):
         geometry(vp.load_robot(arm(tmp_path, name, "1 1 1"), lock={"j2": 0.0}))
+
+
+def test_meshes_without_a_volume_are_named(tmp_path):
+    path = arm(tmp_path, "a.obj", "1 1 1")
+    for faces in (QUADS[:, ::-1], QUADS[:5]):
+        (tmp_path / "a.obj").write_text(wavefront(faces=faces))
+        with refused(vp.RobotError, "'l2'", "a.obj", "no volume"):
+            vp.load_robot(path, inertia="meshes")
+    (tmp_path / "a.obj").unlink()
+    with refused(vp.RobotError, "'l2'", "a.obj", "package_dirs"):
+        vp.load_robot(path, inertia="meshes")
 
 
 @pytest.mark.parametrize("scale", ["1 1", "1 0 1", "one 1 1", "inf 1 1"])

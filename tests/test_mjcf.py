@@ -200,8 +200,8 @@ def test_shapes_and_sites_are_where_mujoco_has_them(tmp_path):
     np.testing.assert_allclose(robot.frame_positions(q, "spot"), data.site("spot").xpos, rtol=0, atol=1e-14)
     shapes = {shape.name: shape for shape in geometry(robot).geometryObjects}
     assert set(shapes) == {"ball", "a_geom1", "tet", "rod"}
-    its, body = robot.free_model.createData(), data.body("a")
-    pin.forwardKinematics(robot.free_model, its, q)
+    its, body = robot.model.createData(), data.body("a")
+    pin.forwardKinematics(robot.model, its, q)
     place = {name: its.oMi[shape.parentJoint] * shape.placement for name, shape in shapes.items()}
     np.testing.assert_allclose(place["ball"].translation, data.geom("ball").xpos, rtol=0, atol=1e-14)
     middle = body.xpos + body.xmat.reshape(3, 3) @ [0.05, 0.1, 0.15]

@@ -104,57 +104,6 @@ def test_a_tendon_of_two_joints_ties_them(tmp_path, offset):
             np.testing.assert_allclose(-2.0 * mine, its, rtol=0, atol=1e-13)
 
 
-def rod(name, place, length, inside="", at="0 0 0"):
-    """A rod along its x axis that turns about y."""
-    return (
-        f'<body name="{name}" pos="{place}" euler="{at}"><joint name="{name}" axis="0 1 0" class="rod"/><geom '
-        f'type="capsule" fromto="0 0 0 {length} 0 0" size="0.01" mass="{length}"/>{inside}</body>'
-    )
-
-
-STIFF = (
-    '<default><equality solref="4e-4 1" solimp="0.9999 0.9999 0.001"/><default class="rod"><joint damping="0.002"/>'
-    "</default></default>"
-)
-
-
-def finger(side, x, sign):
-    """Driver and coupler, and the two links that they keep parallel, as in Robotiq's 2F-85."""
-    coupler = rod(f"{side}_coupler", "0.04 0 0", 0.03, at=f"0 {sign * 0.9} 0")
-    follower = rod(f"{side}_follower", "0.05 0 0", 0.05, at=f"0 {-sign * 0.4} 0")
-    return rod(f"{side}_driver", f"{x} 0 0", 0.04, coupler, at=f"0 {-1.57 + sign * 0.7} 0") + rod(
-        f"{side}_spring_link", f"{0.4 * x} 0 0.01", 0.05, follower, at=f"0 {-1.57 + sign * 0.5} 0"
-    )
-
-
-GRIPPER = document(
-    '<connect body1="right_follower" body2="right_coupler" anchor="-0.01 0 0.02"/>'
-    '<connect body1="left_follower" body2="left_coupler" anchor="-0.01 0 0.02"/>'
-    '<joint joint1="right_driver" joint2="left_driver" polycoef="0 -1 0 0 0"/>',
-    STIFF,
-    world=finger("right", 0.03, 1.0) + finger("left", -0.03, -1.0),
-)
-
-
-def mujoco_motion(model, data, q, steps, dt):
-    """Positions (n,) of the joints after so many steps of MuJoCo, and the largest miss of its equality constraints."""
-    model.opt.timestep, model.opt.integrator = dt, mujoco.mjtIntegrator.mjINT_RK4
-    data.qpos[:], data.qvel[:] = q, 0.0
-    mujoco.mj_step(model, data, steps)
-    return data.qpos.copy(), np.abs(rows(model, data, data.qpos)[0]).max()
-
-
-def test_motions_are_mujoco_s(tmp_path):
-    robot, model, data = both(tmp_path, GRIPPER)
-    scene = vp.Scene(robot, constraints="robot", damping="robot")
-    q0 = vp.assemble(scene, np.zeros(8))
-    motion = vp.simulate(scene, q0, np.zeros(robot.dof), dt=0.01, steps=100, integrator=vp.Gauss(3))
-    its, miss = mujoco_motion(model, data, q0, 2500, 4e-4)
-    assert miss < 1e-7
-    assert np.abs(motion.q[-1] - q0).max() > 0.3
-    np.testing.assert_allclose(motion.q[-1], its, rtol=0, atol=1e-6)
-
-
 def upright(roll: str, offset: float = 0.0) -> str:
     """A four-bar in the x z plane whose joints turn about z of bodies that are rolled by a quarter turn."""
 

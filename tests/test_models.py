@@ -41,11 +41,3 @@ def test_stretched_along_x_with_the_tip_at_its_end(finger):
     np.testing.assert_allclose(data.oMf[tip].translation, [sum(LENGTHS), 0.0, 0.0], rtol=1e-14)
     places = [data.oMi[joint].translation[0] for joint in (1, 2, 3)]
     np.testing.assert_allclose(places, [0.0, LENGTHS[0], LENGTHS[0] + LENGTHS[1]], rtol=1e-14)
-
-
-def test_positive_angles_flex_within_the_limits(finger):
-    lower, upper = finger.position_limits
-    np.testing.assert_allclose(np.degrees(lower), [-30.0, 0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(np.degrees(upper), [90.0, 100.0, 80.0], rtol=1e-14)
-    assert (finger.effort_limit == 10.0).all()
-    assert (finger.velocity_limit == 200.0).all()

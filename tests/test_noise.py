@@ -259,3 +259,13 @@ def test_the_mean_of_noise_in_proportion_to_the_velocity(integrator):
         for dw in (np.sqrt(dt), -np.sqrt(dt))
     ]
     assert np.mean(ends) - 1.0 == pytest.approx(0.5 * s**2 * dt, rel=2e-3)
+
+
+def test_noise_of_controls_within_a_step_is_that_of_their_mean():
+    """A control that grows over the step by du has a mean that is du / 2 larger."""
+    scene, start = chain(vp.ControlNoise(0.3), damping=0.1), ([0.3, 0.2], [0.0, 1.0])
+    push = vp.OpenLoop(lambda t: [np.sin(9.0 * t), 1.0])
+    motion = vp.simulate(scene, *start, dt=0.02, steps=4, controls=push, integrator=vp.Gauss(2), increments=0.0)
+    lin = vp.linearize(scene, motion)
+    np.testing.assert_array_equal(lin.Gramp, 0.5 * lin.Gu)
+    assert np.abs(lin.Gu).max() > 1e-3

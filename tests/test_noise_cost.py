@@ -103,23 +103,6 @@ def test_in_the_long_steps_of_a_plan_it_is_close_to_that_of_fine_steps(damping):
     assert noise_cost(Steps(left, left.simulate(found.trajectory.u)), feedback) > 1.02 * there
 
 
-@pytest.mark.parametrize("damping", [0.05, 1.5, 30.0])
-def test_what_velocities_cost_within_steps(damping):
-    """At rest, with the share of the samples, it is their exact mean variance after a step from a known state."""
-    level, dt = 0.3, 0.1
-    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=damping, noise=vp.AdditiveNoise(level))
-    cost = vp.VelocityCost(1.0) + vp.ControlCost(1.0)
-    problem = vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=dt, steps=1)
-    motion = problem.simulate(np.zeros((1, 1)))
-    still = Feedback(np.zeros((1, 1, 2)), None)
-    found = noise_cost(Steps(problem, motion), still)
-    inertia = vp.lagrangian_jet(scene, [0.0], [0.0]).Lvv[0, 0]
-    rate = damping / inertia
-    variance = (level / inertia) ** 2 / (2.0 * rate)
-    mean = dt - (1.0 - np.exp(-2.0 * rate * dt)) / (2.0 * rate)
-    assert found == pytest.approx(variance * mean, rel=1e-5)
-
-
 @pytest.mark.parametrize(("strength", "told"), [(5e-4, True), (5e-5, False)])
 def test_feedback_as_fast_as_the_steps_is_told_of_where_noise_matters(strength, told):
     """The rest of the noise, beside its mean over a step, costs a fifth of it; a small part of the expected cost."""
@@ -180,14 +163,16 @@ def test_in_fast_motions_of_arms_it_is_that_of_fine_steps(damping):
 
 @pytest.mark.parametrize("integrator", [None, vp.Gauss(2, kick="held"), vp.Radau(3, kick="held")])
 @pytest.mark.parametrize("damping", [0.0, 0.05, 1.5, 30.0])
-def test_what_the_last_step_leaves_of_the_last_velocity(damping, integrator):
-    """The exact variance of white noise over a step, of which a force held over it leaves less."""
+def test_what_velocities_cost_in_a_step_from_rest(damping, integrator):
+    """The exact variance of white noise over a step: its mean within the step, and at the end of the last one."""
     level, dt = 0.3, 0.1
     scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=damping, noise=vp.AdditiveNoise(level))
-    cost = vp.ControlCost(1.0) + vp.Terminal(vp.VelocityCost(2.0))
-    problem = vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=dt, steps=1, integrator=integrator)
-    found = noise_cost(Steps(problem, problem.simulate(np.zeros((1, 1)))), Feedback(np.zeros((1, 1, 2)), None))
     inertia = vp.lagrangian_jet(scene, [0.0], [0.0]).Lvv[0, 0]
-    rate = damping / inertia
-    left = -np.expm1(-2.0 * rate * dt) / (2.0 * rate) if damping else dt
-    assert found == pytest.approx(2.0 * (level / inertia) ** 2 * left, rel=1e-5)
+    rate = 2.0 * damping / inertia
+    left = -np.expm1(-rate * dt) / rate if damping else dt
+    within = (dt - left) / rate if damping else 0.5 * dt**2
+    for cost, exact in ((vp.VelocityCost(1.0), within), (vp.Terminal(vp.VelocityCost(2.0)), 2.0 * left)):
+        given = {"dt": dt, "steps": 1, "integrator": integrator}
+        problem = vp.OptimalControlProblem(scene, vp.ControlCost(1.0) + cost, [0.0], [0.0], **given)
+        found = noise_cost(Steps(problem, problem.simulate(np.zeros((1, 1)))), Feedback(np.zeros((1, 1, 2)), None))
+        assert found == pytest.approx((level / inertia) ** 2 * exact, rel=1e-5)

@@ -238,7 +238,7 @@ def test_regularization_makes_nothing_infeasible(name: str) -> None:
 
 def test_a_start_outside_that_one_step_mends_is_no_reason_to_end() -> None:
     mends = vp.WithinJointLimits(TWO, ([0.05, -1], [2.0, 1]))
-    for options in ({}, {"control_limits": (-2000.0, 2000.0)}):
+    for options in ({}, {"control_limits": (-2000.0, 2000.0)}, {"controls": "linear", "between_nodes": True}):
         plan = vp.solve(reach(mends, **options), check=False)
         assert plan.status is vp.Status.CONVERGED
         assert violation(plan.problem, plan.trajectory, plan.controls) <= MET

@@ -90,7 +90,7 @@ def test_errors_of_a_call(urdf):
         robot.posture("leg/home")
     with refused(vp.UnknownJoint, "'j9'"):
         robot.posture("home", others={"j9": 1.0})
-    with refused(vp.UnknownPosture, "SRDF"):
+    with refused(vp.UnknownPosture, "srdf=path"):
         vp.load_robot("ur5").posture("home")
 
 
@@ -120,7 +120,7 @@ BAD = {
     "no value": (SRDF.replace('value="0.5"', ""), ("'j1'", "''")),
     "infinite": (SRDF.replace('"0.5"', '"inf"'), ("'j1'", "'inf'")),
     "broken": (SRDF[:-5], ("made_up.srdf", "XML")),
-    "empty": ("", ("made_up.srdf", "XML")),
+    "empty": ("", ("made_up.srdf", "empty")),
     "another format": (SRDF.replace("robot", "sdf"), ("made_up.srdf", "<sdf>")),
 }
 

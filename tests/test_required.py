@@ -90,31 +90,6 @@ def test_fingers_are_independent(tmp_path):
     assert file.required.parts == (INDEX, THUMB)
 
 
-def test_locked_joints_are_no_bodies():
-    """A Panda that moves two joints is a two-body arm, whose inertias add up from the links that are carried."""
-    lock = {f"panda_joint{k}": 0.3 for k in (1, 3, 5, 6, 7)} | {"panda_finger_joint1": 0.02}
-    robot, twin = vp.load_robot("panda", lock=lock), vp.load_robot(two_joint_panda(lock))
-    assert robot.dof == robot.tree.parent.size == 2
-    motions = [vp.simulate(vp.Scene(arm), [0.2, -1.0], [0.5, 0.0], dt=5e-3, steps=100) for arm in (robot, twin)]
-    np.testing.assert_allclose(motions[0].q, motions[1].q, rtol=0, atol=1e-11)
-
-
-def two_joint_panda(lock):
-    """panda_joint2 and panda_joint4 with everything they carry, added up link by link."""
-    model = vp.load_robot("panda").free_model
-    data, q = model.createData(), pin.neutral(model)
-    for name, value in (lock | {"panda_finger_joint2": 0.02}).items():
-        q[model.joints[model.getJointId(name)].idx_q] = value
-    pin.forwardKinematics(model, data, q)
-    arm, shoulder, elbow = pin.Model(), model.getJointId("panda_joint2"), model.getJointId("panda_joint4")
-    own = {shoulder: arm.addJoint(0, pin.JointModelRZ(), data.oMi[shoulder], "shoulder")}
-    own[elbow] = arm.addJoint(own[shoulder], pin.JointModelRZ(), data.oMi[shoulder].actInv(data.oMi[elbow]), "elbow")
-    for joint in range(shoulder, model.njoints):
-        carrier = elbow if joint >= elbow else shoulder
-        arm.appendBodyToJoint(own[carrier], model.inertias[joint], data.oMi[carrier].actInv(data.oMi[joint]))
-    return arm
-
-
 def test_payload_is_what_pinocchio_makes_of_it(load):
     """Mass matrix with a payload: that of the robot without, and of the payload's body by its Jacobian."""
     inertia = np.array([[2e-3, 1e-4, 0.0], [1e-4, 3e-3, 2e-4], [0.0, 2e-4, 4e-3]])
@@ -147,11 +122,6 @@ def test_payload_is_what_pinocchio_makes_of_it(load):
 def test_payload_that_cannot_be(given, facts):
     with refused(vp.InputError, facts):
         vp.load_robot("ur5", payload=vp.Payload(**{"frame": "tool0", "mass": 1.0} | given))
-
-
-def test_payload_on_a_frame_that_the_robot_does_not_have():
-    with refused(vp.UnknownFrame, "'tool'", "'tool0'"):
-        vp.load_robot("ur5", payload=vp.Payload("tool", 1.0))
 
 
 def every_force(robot):
@@ -228,6 +198,14 @@ def test_servos_hold_idle_joints_and_move_the_others():
 def test_what_touches_a_joint_in_python(given, joints):
     scene = vp.Scene(vp.load_robot("allegro_right_hand"), gravity=False)
     assert len(scene.required(0.0, **given).joints) == joints
+
+
+def test_gravity_along_an_axis_touches_no_joint():
+    model = pin.Model()
+    for name in ("one", "two"):
+        joint = model.addJoint(0, pin.JointModelRZ(), pin.SE3.Identity(), name)
+        model.appendBodyToJoint(joint, pin.Inertia.FromSphere(1.0, 0.1), pin.SE3(np.eye(3), np.array([0.3, 0, 0])))
+    assert vp.Scene(vp.load_robot(model)).required(0.0, {"one": 1.0}).joints == ("one",)
 
 
 def test_held_joints_are_those_of_a_robot_that_is_loaded_with_them():

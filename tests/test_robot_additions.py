@@ -3,6 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from mechanisms import joint, link, write_urdf
 from refusals import refused
 
 import varpin as vp
@@ -14,7 +15,7 @@ RNG = np.random.default_rng(5)
 
 def mass_and_gravity(robot, q):
     """M and the gravity torques by Pinocchio, of the robot's own model."""
-    model = robot.free_model
+    model = robot.model
     data = model.createData()
     M = pin.crba(model, data, q)
     return np.triu(M) + np.triu(M, 1).T, pin.computeGeneralizedGravity(model, data, q)
@@ -100,77 +101,29 @@ class TestArmature:
             np.testing.assert_allclose(mass_and_gravity(robot, q)[0], own, rtol=0, atol=1e-10)
 
 
-LINKS = """
-<robot name="shapes">
-  <link name="base"/>
-  <joint name="first" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/></joint>
-  <link name="upper">{inertial}
-    <visual><origin xyz="0.5 0 0" rpy="0 0 0.3"/><geometry><box size="1 0.1 0.2"/></geometry></visual>
-    <visual><origin xyz="1 0 0"/><geometry><sphere radius="0.2"/></geometry></visual>
-  </link>
-  <joint name="second" type="continuous"><origin xyz="1 0 0"/><parent link="upper"/><child link="lower"/></joint>
-  <link name="lower">
-    <visual><origin xyz="0 0 0.1"/><geometry><mesh filename="{mesh}" scale="1 2 1"/></geometry></visual>
-  </link>
-</robot>
-"""
-# A box of 0.1 x 0.2 x 0.3 m in its corner.
-FACES = [
-    *((0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)),
-    *((2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)),
-]
-BOX = np.array([[x, y, z] for x in (0.0, 0.1) for y in (0.0, 0.2) for z in (0.0, 0.3)])
+SHAPES = """
+<visual><origin xyz="0.5 0 0" rpy="0 0 0.3"/><geometry><box size="1 0.1 0.2"/></geometry></visual>
+<visual><origin xyz="1 0 0"/><geometry><sphere radius="0.2"/></geometry></visual>"""
 
 
-def written(folder, faces=FACES, inertial=""):
-    lines = [f"v {x} {y} {z}" for x, y, z in BOX] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
-    (folder / "box.obj").write_text("\n".join(lines) + "\n")
-    path = folder / "shapes.urdf"
-    path.write_text(LINKS.format(inertial=inertial, mesh="box.obj"))
-    return path
-
-
-def box(size, center, turn=0.0):
-    a, b, c = size
-    mass = 500.0 * a * b * c
-    inertia = pin.Inertia(mass, np.zeros(3), mass / 12.0 * np.diag([b * b + c * c, a * a + c * c, a * a + b * b]))
-    return pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, turn), np.array(center)).act(inertia)
-
-
-class TestMeshInertias:
-    def test_boxes_and_balls(self, tmp_path):
-        robot = vp.load_robot(written(tmp_path), inertia="meshes", density=500.0)
+class TestInertiasOfShapes:
+    def test_links_without_an_inertia_have_that_of_their_shapes(self, tmp_path):
+        parts = [link("a", extra=SHAPES), link("b", "", SHAPES), joint("j1", "base", "a"), joint("j2", "a", "b")]
+        robot = vp.load_robot(write_urdf(tmp_path, *parts), inertia="meshes", density=500.0)
+        box = pin.Inertia(10.0, np.zeros(3), 10.0 / 12.0 * np.diag([0.05, 1.04, 1.01]))
         ball = 500.0 * 4.0 / 3.0 * np.pi * 0.2**3
-        upper = box((1.0, 0.1, 0.2), (0.5, 0.0, 0.0), 0.3) + pin.Inertia(
-            ball, np.array([1.0, 0.0, 0.0]), 0.4 * ball * 0.04 * np.eye(3)
-        )
-        lower = box((0.1, 0.4, 0.3), (0.05, 0.2, 0.25))
-        for joint, expected in ((1, upper), (2, lower)):
-            own = robot.free_model.inertias[joint]
-            # Meshes are read in single precision.
-            np.testing.assert_allclose(own.matrix(), expected.matrix(), rtol=0, atol=2e-6)
+        expected = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, 0.3), np.array([0.5, 0.0, 0.0])).act(box)
+        expected += pin.Inertia(ball, np.array([1.0, 0.0, 0.0]), 0.4 * ball * 0.04 * np.eye(3))
+        np.testing.assert_allclose(robot.model.inertias[2].matrix(), expected.matrix(), rtol=0, atol=2e-6)
+        assert robot.model.inertias[1].mass == 1.3
 
-    def test_links_with_an_inertial_keep_it(self, tmp_path):
-        inertial = '<inertial><mass value="3"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
-        robot = vp.load_robot(written(tmp_path, inertial=inertial), inertia="meshes")
-        assert robot.free_model.inertias[1].mass == 3.0
-        assert robot.free_model.inertias[2].mass == pytest.approx(1000.0 * 0.1 * 0.4 * 0.3)
-
-    def test_open_and_missing_meshes_are_named(self, tmp_path):
-        with refused(vp.RobotError, "'lower'", "box.obj"):
-            vp.load_robot(written(tmp_path, faces=[(c, b, a) for a, b, c in FACES]), inertia="meshes")
-        path = written(tmp_path)
-        (tmp_path / "box.obj").unlink()
-        with refused(vp.RobotError, "'lower'", "box.obj", "package_dirs"):
-            vp.load_robot(path, inertia="meshes")
-
-    def test_what_is_refused(self, tmp_path):
+    def test_what_is_refused(self):
         with refused(vp.InputError, "inertia", "'file'", "'meshes'"):
             vp.load_robot("ur5", inertia="mesh")
         with refused(vp.InputError, "inertia"):
             vp.load_robot(vp.load_robot("ur5").model, inertia="meshes")
         with refused(vp.InputError, "density"):
-            vp.load_robot(written(tmp_path), inertia="meshes", density=0.0)
+            vp.load_robot("ur5", inertia="meshes", density=0.0)
 
 
 class TestElsewhere:

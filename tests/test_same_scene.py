@@ -17,7 +17,7 @@ PUSH = vp.FrameWrench("tool0", [3.0, -2.0, 5.0, 0.0, 0.0, 0.0])
 SPRING = vp.FrameSpring("tool0", ("forearm_link", [0.05, 0.1, 0.0]), 8.0)
 OTHERS = {
     "damping": {"damping": [0.1, 0.1, 0.4, 0.1, 0.1, 0.1]},
-    "stiffness": {"stiffness": 0.0},
+    "stiffness": {"stiffness": 3.0},
     "rest": {"rest": 0.2},
     "gravity": {"gravity": False},
     "actuation": {"actuation": 2.0 * np.eye(6)},

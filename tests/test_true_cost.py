@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from findings import about
-from naive import continuous
 from refusals import naming, refused, unnamed
 
 import varpin as vp
@@ -14,25 +13,6 @@ def reach(steps: int, controls: str = "held", **options: object) -> vp.OptimalCo
     cost = vp.ControlCost(1e-3) + vp.VelocityCost(0.1) + vp.Terminal(end)
     given = {"dt": 1.0 / steps, "steps": steps, "controls": controls, "integrator": vp.Gauss(2)} | options
     return vp.OptimalControlProblem(vp.Scene(vp.planar_chain(2), damping=0.1), cost, [0.0, 0.0], [0.0, 0.0], **given)
-
-
-@pytest.mark.parametrize("controls", ["held", "linear"])
-def test_the_first_step_within_the_wish_is_taken(controls: str) -> None:
-    problem = reach(3, controls)
-    plan = vp.solve(problem, true_cost=1e-4)
-    found = plan.refinement
-    assert found.met
-    assert found.chosen == len(found.tried) - 1 >= 1
-    assert plan.status.converged
-    assert abs(plan.verify().closed_loop_loss) <= 1e-4
-    assert all(abs(row.loss) > 1e-4 or row.excess > 1e-4 for row in found.tried[:-1])
-    assert found.tried[-1].excess <= 1e-4
-    np.testing.assert_allclose([row.dt for row in found.tried], [1 / 3 / 2**k for k in range(len(found.tried))])
-    assert plan.problem.steps == found.tried[-1].steps == plan.trajectory.steps
-    assert str(found) in plan.table()
-    # Each row is the plan of its step, from whatever controls it began.
-    cold = vp.solve(problem.at(dt=found.tried[-1].dt), check=False)
-    assert plan.cost == pytest.approx(cold.cost, rel=1e-5)
 
 
 @pytest.mark.parametrize("controls", ["held", "linear"])
@@ -133,52 +113,6 @@ def within(*constraints: vp.PlanConstraint, dt: float = 0.1, steps: int = 12) ->
     return vp.OptimalControlProblem(scene, cost, [0, 0], [0, 0], dt=dt, steps=steps, constraints=constraints)
 
 
-def on_robot(plan: vp.Solution) -> tuple[float, np.ndarray]:
-    """The cost of a plan of ``within`` with feedback, and its velocities in eighths of steps, by DOP853."""
-    problem, policy, parts, given = plan.problem, plan.policy_on("velocity"), 8, []
-
-    def running(t: float, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> float:
-        return 1e-2 * (u @ u + v @ v)
-
-    def law(k: int, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-        if k % parts == 0:
-            decision = k // parts
-            state = np.concatenate([q, v]) - policy.reference[decision]
-            given.append(plan.controls[decision] + policy.gains[decision] @ state)
-        return given[-1]
-
-    rows = np.repeat(plan.controls, parts, axis=0)
-    q, v, integral = continuous(
-        problem.scene, problem.q0, problem.v0, rows, problem.dt / parts, running, law, rtol=1e-9
-    )
-    return integral + 100.0 * ((q[-1] - [1.0, 0.5]) ** 2).sum() + 10.0 * v[-1] @ v[-1], v
-
-
-def test_within_constraints():
-    limited = within(vp.WithinVelocityLimits(vp.planar_chain(2), (-4.8, 1.2)))
-    plan = vp.solve(limited, true_cost=0.01, check=False)
-    found = plan.refinement
-    row = found.tried[found.chosen]
-    assert found.met
-    assert plan.problem.steps == row.steps > 12
-    assert plan.status.converged
-    assert plan.violation <= 1e-6
-    # Multipliers and controls of the plan before are near those of half the step.
-    assert all(finer.iterations < found.tried[0].iterations for finer in found.tried[1:])
-    true, v = on_robot(plan)
-    assert row.true_cost == pytest.approx(true, rel=1e-4)
-    assert abs(true / plan.cost - 1.0) <= 0.01
-    # Held controls exceed the limit between nodes: at 0.1 s by a thirtieth of what is allowed to rest.
-    beyond = (v - 1.2).max() / 6.0
-    assert row.violation == pytest.approx(beyond, rel=1e-2)
-    assert 1e-4 < beyond < 1e-3 < found.tried[0].violation
-    fine = vp.solve(limited.at(dt=plan.problem.dt / 2), check=False)
-    assert fine.violation <= 1e-6
-    assert true <= 1.01 * fine.cost
-    with refused(vp.InputError, "resume", "true_cost"):
-        vp.solve(limited, resume=plan, true_cost=0.1)
-
-
 def test_no_plan_within_constraints() -> None:
     """A step that has none may be too coarse, so half of it is tried, too."""
     goal = vp.ReachFrame(vp.planar_chain(2), "tip", position=[1.0, 0.5, -0.5])
@@ -187,29 +121,6 @@ def test_no_plan_within_constraints() -> None:
     assert len(far.refinement.tried) == 2
     assert not far.refinement.met
     assert about(far.refinement.reason, "no plan within constraints")
-
-
-def goal_problem(steps: int = 3, **options: object) -> vp.OptimalControlProblem:
-    goal = vp.ReachFrame(vp.planar_chain(2), "tip", position=vp.planar_chain(2).frame_positions([1.5, -1.0], "tip"))
-    return reach(steps, constraints=[goal], **options)
-
-
-def test_an_interrupted_comparison_keeps_the_plan() -> None:
-    first = vp.solve(goal_problem(), tolerance=1e-3, check=False)
-    steps: list[int] = []
-
-    def callback(item: vp.Iteration, motion: vp.Trajectory) -> None:
-        steps.append(motion.steps)
-        if motion.steps > 3:
-            raise KeyboardInterrupt
-
-    plan = vp.solve(goal_problem(), true_cost=0.1, callback=callback, check=False)
-    assert steps[-1] == 6
-    assert plan.status is vp.Status.INTERRUPTED
-    assert not plan.refinement.met
-    assert [row.steps for row in plan.refinement.tried] == [3]
-    assert plan.violation <= 1e-6
-    assert plan.cost == pytest.approx(first.cost, rel=1e-6)
 
 
 def test_a_loss_within_the_wish_is_no_warning() -> None:

@@ -137,7 +137,7 @@ class TestOdd:
         assert not facts or naming(caplog.messages, facts)
         assert bool(facts) == bool(caplog.records)
         if kind != "a number with blanks":  # of which Pinocchio's parser reads nothing
-            assert_same(robot.free_model, pin.buildModelFromUrdf(str(path)))
+            assert_same(robot.model, pin.buildModelFromUrdf(str(path)))
         assert robot.joint_names == ("j1",)
         (tie,) = robot.ties
         assert (tie.ratio, tie.offset) == (2.0, 0.1)
@@ -183,8 +183,8 @@ class TestVersions:
     def test_turns_are_as_pinocchio_reads_them(self, tmp_path, version):
         path = self.written(tmp_path, version, f'quat_xyzw="{H} 0 0 {H}"')
         robot = vp.load_robot(path)
-        assert_same(robot.free_model, pin.buildModelFromUrdf(str(path)))
-        turned = robot.free_model.jointPlacements[1].rotation
+        assert_same(robot.model, pin.buildModelFromUrdf(str(path)))
+        turned = robot.model.jointPlacements[1].rotation
         expected = np.eye(3) if version == "1.0" else pin.rpy.rpyToMatrix(np.pi / 2, 0, 0)
         np.testing.assert_allclose(turned, expected, atol=1e-12)
         for part in vp.inspect_robot(path).links:
@@ -420,6 +420,22 @@ class TestMany:
             worker.join()
         os.write(2, b"still here")
         assert "still here" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "facts"),
+    [("", "empty"), ("<html><body/></html>", "<html>"), ("<sdf version='1.7'/>", "<sdf>"), ("{}", "XML")],
+)
+def test_files_that_are_no_urdf(tmp_path, text, facts):
+    with refused(vp.RobotError, "odd.urdf", facts):
+        vp.load_robot(written(tmp_path, text))
+
+
+def test_a_model_whose_joints_have_no_parents_is_refused():
+    model = vp.planar_chain(3).model.copy()
+    model.parents[3] = 9
+    with refused(vp.RobotError, "'chain3'", "damaged"):
+        vp.load_robot(model)
 
 
 @pytest.mark.parametrize(("part", "facts"), [("armature", ("1", "3")), ("lowerPositionLimit", ("1", "3"))])

@@ -80,8 +80,9 @@ def test_package_dirs(workspace, tmp_path):
     elsewhere = tmp_path / "not" / "near" / "it"
     elsewhere.mkdir(parents=True)
     (tmp_path / "parts").rename(elsewhere / "parts")
-    with refused(vp.RobotError, "'parts'"):
+    with refused(vp.RobotError, "'parts'") as caught:
         vp.load_robot(workspace)
+    assert str(caught.value).count("no package") == 1
     assert vp.load_robot(workspace, package_dirs=[elsewhere]).dof == 1
 
 

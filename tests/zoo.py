@@ -240,7 +240,7 @@ add("plane", arm("panda", "panda_finger_joint1", constraints=PLANE), POSTURE, 0.
 def grasp() -> vp.Scene:
     """An arm of seven joints whose hand is welded to the world."""
     panda = vp.load_robot("panda", lock={"panda_finger_joint1": 0.02})
-    model = panda.free_model
+    model = panda.model
     data = model.createData()
     pin.framesForwardKinematics(model, data, np.array(POSTURE))
     place = data.oMf[model.getFrameId("panda_hand")].homogeneous

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.problem import OptimalControlProblem, bind_cost
+from varpin.control.problem import OptimalControlProblem
 from varpin.control.solving import solve
-from varpin.control.stages import states
+from varpin.control.stages import Steps, states
 from varpin.errors import InputError, VarpinError
-from varpin.linearization import linearize_steps, velocity_at_nodes
+from varpin.linearization import velocity_at_nodes
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.signals.commands import open_loop
 from varpin.signals.policy import LinearPolicy
@@ -45,7 +45,7 @@ _NO_LIMIT = 1e30
 
 
 class StepModel(crocoddyl.ActionModelAbstract):
-    """Step ``step`` of a problem with its running cost, as an action of crocoddyl.
+    """The step of a problem of one step, with its running cost, as an action of crocoddyl.
 
     The state is (q, p) for variational integrators and (q, v) for the others, (2n,). ``Fx`` and ``Fu`` are the exact
     derivatives of the step; second derivatives of the cost are Gauss-Newton approximations. Noise is left out. ``u_lb``
@@ -53,70 +53,41 @@ class StepModel(crocoddyl.ActionModelAbstract):
     crocoddyl's line search shortens its step.
     """
 
-    def __init__(self, problem: OptimalControlProblem, step: int) -> None:
-        if problem.constraints:
-            raise InputError("hard constraints of a plan have no counterpart in crocoddyl: make them costs")
-        n, m = problem.scene.robot.dof, problem.scene.controls
-        super().__init__(crocoddyl.StateVector(2 * n), m, 0)
+    def __init__(self, problem: OptimalControlProblem) -> None:
+        super().__init__(crocoddyl.StateVector(2 * problem.scene.robot.dof), problem.scene.controls, 0)
         self._problem = problem
-        samples = len(problem.rule)
-        times = problem.running.points.t[step * samples : (step + 1) * samples]
-        self._running, _ = bind_cost(problem.cost, times, problem.running.points)
         self._known: tuple[Floats, Floats, Trajectory] | None = None
         if problem.limited:
             self.u_lb, self.u_ub = np.clip(problem.control_limits, -_NO_LIMIT, _NO_LIMIT)
 
     def calc(self, data: Any, x: Floats, u: Floats | None = None) -> None:
         """The next state and the cost of the step."""
-        problem = self._problem
-        control = np.zeros(problem.scene.controls) if u is None else u
-        motion = self._step(x, control)
+        problem, motion = self._problem, self._step(x, u)
         if motion is None:
             data.xnext, data.cost = np.full(x.size, np.nan), np.inf
             return
         data.xnext = states(problem, motion)[1]
-        samples = problem.samples(motion.q, motion.v, control[None])
-        data.cost = self._weight * float(self._running.value(*samples).sum())
+        values = problem.running.value(*problem.samples(motion.q, motion.v, motion.u))
+        # All samples of a rule have the same weight.
+        data.cost = float(problem.dt * problem.rule[0, 0] * values.sum())
 
     def calcDiff(self, data: Any, x: Floats, u: Floats | None = None) -> None:  # crocoddyl's name
         """Derivatives of the next state and of the cost."""
-        problem, scene = self._problem, self._problem.scene
-        n, m = scene.robot.dof, scene.controls
-        control = np.zeros(m) if u is None else u
-        motion = self._step(x, control)
+        motion = self._step(x, u)
         if motion is None:
             raise VarpinError("a step that cannot be solved has no derivatives")
-        lin = linearize_steps(scene, motion, problem.integrator, problem.q0)
-        A, B = lin.A[0], lin.B[0]
-        # Rates of q0, v0, q1, v1 in (x, u).
-        before, after = np.eye(2 * n, 2 * n + m), np.hstack([A, B])
-        nodes = [before[:n], before[n:], after[:n], after[n:]]
-        if problem.integrator.variational:
-            velocity = velocity_at_nodes(scene, motion.q, motion.v)
-            nodes[1], nodes[3] = velocity[0] @ before, velocity[1] @ after
-        expansion = self._running.expand(*problem.samples(motion.q, motion.v, control[None]))
-        gradient, hessian = np.zeros(2 * n + m), np.zeros((2 * n + m, 2 * n + m))
-        for i, row in enumerate(problem.rule):
-            J = np.vstack(
-                [sum(row[begin + c] * node for c, node in enumerate(nodes)) for begin in (1, 5)]
-                + [np.eye(m, 2 * n + m, 2 * n)]
-            )
-            gradient += self._weight * J.T @ expansion.gradient[i]
-            hessian += self._weight * J.T @ expansion.hessian[min(i, len(expansion.hessian) - 1)] @ J
-        data.Fx, data.Fu = A, B
-        data.Lx, data.Lu = gradient[: 2 * n], gradient[2 * n :]
-        data.Lxx, data.Lxu, data.Luu = hessian[: 2 * n, : 2 * n], hessian[: 2 * n, 2 * n :], hessian[2 * n :, 2 * n :]
+        steps, at, by = Steps(self._problem, motion), slice(0, x.size), slice(x.size, None)
+        (J,), (gradient,), (hessian,) = steps.J, *steps.costs
+        data.Fx, data.Fu = J[:, at], J[:, by]
+        data.Lx, data.Lu = gradient[at], gradient[by]
+        data.Lxx, data.Lxu, data.Luu = hessian[at, at], hessian[at, by], hessian[by, by]
 
-    @property
-    def _weight(self) -> float:
-        # All samples of a rule have the same weight.
-        return float(self._problem.dt * self._problem.rule[0, 0])
-
-    def _step(self, x: Floats, u: Floats) -> Trajectory | None:
+    def _step(self, x: Floats, u: Floats | None) -> Trajectory | None:
         """The step from x under u. The last one is cached, as crocoddyl needs its derivatives next."""
+        problem = self._problem
+        u = np.zeros(problem.scene.controls) if u is None else u
         if self._known is not None and np.array_equal(self._known[0], x) and np.array_equal(self._known[1], u):
             return self._known[2]
-        problem = self._problem
         q, v = _configuration_and_velocity(problem, x)
         if not (np.isfinite(q).all() and np.isfinite(v).all() and np.isfinite(u).all()):
             return None
@@ -174,9 +145,12 @@ def shooting_problem(problem: OptimalControlProblem) -> crocoddyl.ShootingProble
         raise InputError("crocoddyl's actions hold their control over a step; the problem's are linear between nodes")
     if problem.hold != 1:
         raise InputError(f"crocoddyl decides at every step; the problem holds its controls over {problem.hold}")
-    q, v = problem.q0, problem.v0
+    if problem.constraints:
+        raise InputError("hard constraints of a plan have no counterpart in crocoddyl: make them costs")
+    q, v, one = problem.q0, problem.v0, problem.at(steps=1, integrator=problem.integrator)
     x0 = np.concatenate([q, lagrangian_jet(problem.scene, q, v).Lv if problem.integrator.variational else v])
-    return crocoddyl.ShootingProblem(x0, [StepModel(problem, k) for k in range(problem.steps)], EndModel(problem))
+    models = [StepModel(one.at(t0=problem.t0 + k * problem.dt)) for k in range(problem.steps)]
+    return crocoddyl.ShootingProblem(x0, models, EndModel(problem))
 
 
 def first_guess(problem: OptimalControlProblem) -> tuple[list[Floats], list[Floats]]:

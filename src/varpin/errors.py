@@ -139,19 +139,19 @@ class UnknownName(InputError):
 
 
 class UnknownJoint(UnknownName):
-    """A joint name that the robot does not have, or that no control has."""
+    """A joint ``name`` that is not ``known`` to the robot or its controls, and the similar names, ``matches``."""
 
     kind = "joints"
 
 
 class UnknownFrame(UnknownName):
-    """A frame name that the robot, or none of several robots, has."""
+    """A frame ``name`` that is not ``known`` to the robots, and the similar names, ``matches``."""
 
     kind = "frames"
 
 
 class UnknownPosture(UnknownName):
-    """A posture that the robot does not have."""
+    """A posture whose ``name`` is not ``known`` to the robot, and the similar names, ``matches``."""
 
     kind = "postures, from load_robot(..., srdf=path)"
 

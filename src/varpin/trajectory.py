@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -241,10 +242,17 @@ class Trajectory(Frozen):
         return made
 
     def __post_init__(self) -> None:
-        """Arrays that are left out have no columns."""
-        N, m = len(self.t) - 1, self.u.shape[1]
-        shapes = {"constraint_forces": (N, len(self.constraint_labels)), "u_stages": (N, 0, m), "u_nodes": (N + 1, 0)}
+        """Check shapes; arrays that are left out have no columns."""
+        N, n = np.size(self.t) - 1, len(self.joint_names)
+        m, k = (np.shape(array)[1] if np.ndim(array) == 2 else 0 for array in (self.u, self.dw))
+        shapes: dict[str, Any] = {"t": (N + 1,), "energy": (N + 1,), "u": (N, m), "dw": (N, k)}
+        shapes |= dict.fromkeys("qvp", (N + 1, n))
         for name, shape in shapes.items():
+            array = getattr(self, name)
+            if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
+                raise InputError(f"a trajectory's {name} must be a float64 array {shape}, got {reprlib.repr(array)}")
+        left_out = {"constraint_forces": (N, len(self.constraint_labels)), "u_stages": (N, 0, m), "u_nodes": (N + 1, 0)}
+        for name, shape in left_out.items():
             if not getattr(self, name).size:
                 object.__setattr__(self, name, np.zeros(shape))
         _sealed(self.statistics)
@@ -310,21 +318,14 @@ class Trajectory(Frozen):
         )
 
     def _repr_html_(self) -> str:
-        statistics = self.statistics
         rows: list[tuple[str, object]] = [
             ("steps", f"{self.steps} of {self.dt:g} s, {self.duration:g} s in all"),
             ("integrator", self.integrator),
             ("energy [J]", f"{self.energy[0]:.6g} at first, {self.energy[-1]:.6g} in the end"),
             ("energy's largest change [J]", f"{np.abs(self.energy - self.energy[0]).max():.3g}"),
         ]
-        if statistics.energy_defect.any():
-            rows.append(("of it, not the work of a force [J]", f"{np.abs(statistics.energy_defect).max():.3g}"))
         if self.error_text:
             rows.append(("estimated error of q [rad or m]", self.error_text.removeprefix("error ")))
-        if statistics.newton_iterations.any():
-            rows.append(("Newton iterations", f"{statistics.newton_iterations.mean():.2f} a step"))
-        if statistics.split_steps:
-            rows.append(("split by the guards", f"{statistics.split_steps} steps"))
         rows += [("warning", warning) for warning in self.warnings]
         ends = zip(self.joint_names, self.q[0], self.q[-1], self.q.min(axis=0), self.q.max(axis=0), strict=True)
         speeds = np.abs(self.v).max(axis=0)
@@ -370,10 +371,6 @@ class Trajectory(Frozen):
         expected = found.t[0] + np.arange(found.steps + 1) * found.dt
         if not found.dt > 0.0 or not np.allclose(found.t, expected, rtol=1e-9, atol=1e-9 * found.dt):
             raise FileError(f"{source}: its times t are not dt = {found.dt} s apart")
-        if len(found.joint_names) != found.q.shape[1]:
-            raise FileError(
-                f"{source}: {len(found.joint_names)} joint_names are not those of {found.q.shape[1]} joints"
-            )
         if robot is not None:
             found._require_robot(source, robot)
         return found

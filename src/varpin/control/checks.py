@@ -98,7 +98,7 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
 def foreseen(problem: OptimalControlProblem) -> list[Finding]:
     """Findings about a problem before any search; where values are in wrong units, these alone."""
     goals = [*_goals(problem)]
-    units = [*in_other_units(problem.scene, problem.q0), *_in_milliseconds(problem), *_in_degrees(problem)]
+    units = [*in_other_units(problem.scene, problem.q0, problem.v0), *_in_milliseconds(problem), *_in_degrees(problem)]
     units += [*_in_millimetres(problem), *(own for own in goals if own.kind == "goal in millimetres")]
     return [*ranked(units)] or [*_starts_outside(problem), *goals, *_outside(problem), *_weights(problem)]
 
@@ -203,7 +203,7 @@ def _outside(problem: OptimalControlProblem) -> Iterator[Finding]:
 def _weights(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Limits of joint torques that cannot hold the arm at rest where it starts, or where it is to end."""
     scene, names = problem.scene, problem.scene.robot.joint_names
-    if not problem.limited or scene.constraints or not (scene.direct and scene.direct_efforts):
+    if not problem.limited or scene.constraints or not scene.direct or scene.servo_joints or scene.inputs:
         return
     postures: list[tuple[str, Floats]] = [] if problem.v0.any() else [("the start", problem.q0)]
     postures += [("the goal of the terminal TrackingCost", end) for end in _postures(problem)]

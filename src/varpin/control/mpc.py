@@ -512,6 +512,6 @@ def _margins(problem: OptimalControlProblem, previous: Solution, known: Multipli
         rows = np.searchsorted(old.places, new.places)
         backoff.append(values[np.minimum(rows, len(old.places) - 1)])
     # Between nodes as at the end of the step.
-    backoff += [backoff[i][instants.of(i)[:, 0]] for i in instants.constraints]
+    backoff += [backoff[i][instants.of(i)[0]] for i in instants.constraints]
     size = sum(item.size for item in enforced(problem, instants).bound_constraints)
     return Multipliers(values=np.zeros(size), backoff=flat(backoff), between=instants)

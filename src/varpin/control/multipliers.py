@@ -57,10 +57,8 @@ class ConstraintReport(Frozen):
         label: The constraint.
         rows: Description of each row.
         unit: Unit of the values.
-        t: Times of its places (K,) [s]: nodes, and instants between them at which it would not hold otherwise. Each row
-            of such an instant is at a peak of its own, and the time is their mean.
+        t: Times of its places (K,) [s]: nodes, and instants between them at which it would not hold otherwise.
         values: c at each place (K, rows), margin included. The constraint holds where c <= 0, an equality where c = 0.
-            Rows that have no peak at an instant have minus a tenth of the constraint's range there.
         multipliers: (K, rows) [cost / unit]: decrease of the least cost per unit by which the bound is relaxed.
         equality: Whether the constraint is c = 0 rather than c <= 0.
     """

@@ -519,13 +519,12 @@ class OptimalControlProblem(Frozen):
         q and v (..., N s, n) and u (..., N s, m), from q and v at the nodes (..., N + 1, n) and u (..., N, m), or
         (..., N + 1, m) at the nodes where controls are linear between them.
         """
-        nodes = q[..., :-1, :], v[..., :-1, :], q[..., 1:, :], v[..., 1:, :]
         shape = *q.shape[:-2], (q.shape[-2] - 1) * len(self.rule), q.shape[-1]
+        nodes, weights = (q[..., :-1, :], v[..., :-1, :], q[..., 1:, :], v[..., 1:, :]), self.rule[:, 1:].reshape(-1, 4)
         # A node without weight may be NaN.
-        at_q, at_v = (
-            np.stack([sum(w * x for w, x in zip(row, nodes, strict=True) if w) for row in rows], -2).reshape(shape)
-            for rows in (self.rule[:, 1:5], self.rule[:, 5:])
-        )
+        used = np.flatnonzero(weights.any(axis=0))
+        at = weights[:, used] @ np.stack([nodes[i] for i in used], -2)
+        at_q, at_v = at[..., ::2, :].reshape(shape), at[..., 1::2, :].reshape(shape)
         if self.linear:
             share = self.places[:, None]
             between = (1.0 - share) * u[..., :-1, None, :] + share * u[..., 1:, None, :]

@@ -73,10 +73,8 @@ def _require_rows(source: Path, multipliers: Multipliers, problem: OptimalContro
     """Refuse multipliers of another number of rows, or of instants that the problem does not have."""
     between = multipliers.between
     last = len(problem.constraints), problem.steps
-    if not ((between.rows[:, :2] >= 0) & (between.rows[:, :2] < last)).all():
+    if not ((between.rows >= 0) & (between.rows < last)).all():
         raise FileError(f"{source}: multipliers.between.rows are not in the problem's steps")
-    if sum(len(problem.bound_constraints[i].rows) for i in between.rows[:, 0]) != between.moments.size:
-        raise FileError(f"{source}: multipliers.between.moments do not belong to these rows")
     every = sum(item.size for item in enforced(problem, between).bound_constraints)
     at_nodes = sum(item.size for item in problem.bound_constraints)
     for name, expected in (("values", every), ("backoff", every), ("added", at_nodes)):

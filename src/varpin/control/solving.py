@@ -240,7 +240,8 @@ def _commands_along(problem: OptimalControlProblem, path: _Path, controls: Float
     scene, hold, (q, v), u = problem.scene, problem.hold, path, controls
     m = scene.controls
     if u is None:
-        u = as_moved(scene, q[hold::hold], v[hold::hold], _joint_forces(problem, q, v) @ scene.allocation.T)
+        torques = _joint_forces(problem, q, v) @ np.linalg.pinv(scene.actuation).T
+        u = as_moved(scene, q[hold::hold], v[hold::hold], torques)
         u = np.clip(u, *problem.control_limits)
     q, v = q[:-1:hold], v[:-1:hold]
     if problem.integrator.variational:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from varpin.arrays import Floats, Integers, Mask
-from varpin.control.between_nodes import BoundBetween, BoundOnCubics
+from varpin.control.between_nodes import BoundBetween
 from varpin.control.constraints import BoundConstraint, BoundRate
 from varpin.control.costs import CostError, Expansion
 from varpin.control.problem import OptimalControlProblem
@@ -461,13 +461,14 @@ class Stages(Frozen):
             at = np.stack([layout.control(bound.places - 1)[:, columns], layout.control(bound.places)[:, columns]], 2)
             pair = np.broadcast_to(np.array([-1.0, 1.0]) / bound.period, at.shape)
             return np.concatenate([at, at], axis=1).reshape(-1, 2), np.concatenate([pair, -pair], 1).reshape(-1, 2)
-        if isinstance(bound, BoundBetween):
+        if isinstance(bound, BoundBetween) and bound.ends is not None:
             J = bound.slopes(motion.q, motion.v, self.steps.problem.control_rows(motion))
-            x, at = layout.states, layout.in_stage(bound.begins)
-            J = np.concatenate([J[:, :, :x] @ self.steps.slopes[bound.begins], J[:, :, x:]], axis=2)
+            begins, x = bound.places - 1, layout.states
+            at = layout.in_stage(begins)
+            J = np.concatenate([J[:, :, :x] @ self.steps.slopes[begins], J[:, :, x:]], axis=2)
         else:
             nodes, slopes = [bound.places], [bound.jacobian(motion.q, motion.v)]
-            if isinstance(bound, BoundOnCubics):
+            if isinstance(bound, BoundBetween):
                 nodes, slopes = [bound.places - 1, bound.places], bound.by_nodes(slopes[0])
             at = np.concatenate([layout.state(k) for k in nodes], axis=1)
             J = np.concatenate([part @ self.steps.slopes[k] for k, part in zip(nodes, slopes, strict=True)], axis=2)

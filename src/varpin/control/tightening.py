@@ -7,7 +7,7 @@ import contextlib
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.between_nodes import NOWHERE, BoundBetween, Instants
+from varpin.control.between_nodes import NOWHERE, Instants
 from varpin.control.constraints import BoundConstraint
 from varpin.control.margins import widened
 from varpin.control.noise import deviations
@@ -104,10 +104,9 @@ class Tightening:
         spreads = iter(deviations(along, Feedback(plan.feedback, plan.previous), kept))
         more = [np.zeros(1)] * len(self.bound)
         if self.added is not None:
-            more = [*self.added, *(self.added[i][self.between.of(i)[:, 0]] for i in self.between.constraints)]
+            more = [*self.added, *(self.added[i][self.between.of(i)[0]] for i in self.between.constraints)]
         found = []
         for item, used, extra in zip(self.bound, self.margins, more, strict=True):
-            own = item.source.margin * next(spreads) if item.source.margin > 0.0 else np.zeros(item.shape)
-            own = np.where(item.in_force if isinstance(item, BoundBetween) else True, own + extra, 0.0)
+            own = extra + (item.source.margin * next(spreads) if item.source.margin > 0.0 else np.zeros(item.shape))
             found.append((np.minimum(share * (own - used), most * own), own))
         return found

@@ -148,7 +148,7 @@ def simulate_ensemble(
             raise EnsembleInterrupted(kept) from None
     if len(sums.failures) == paths:
         raise VarpinError(sums.failing())
-    found = (*in_other_units(scene, start[0][0]), *moved, *_alike(scene, start), *sums.lost(), *found)
+    found = (*in_other_units(scene, start[0][0], start[1][0]), *moved, *_alike(scene, start), *sums.lost(), *found)
     announce(logger, scene.announced, dt, found)
     return sums.ensemble(found)
 

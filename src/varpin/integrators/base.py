@@ -5,11 +5,10 @@ Equation (N1) of docs/mathematics.md, the Ito correction; (1.3) of the paper.
 
 from __future__ import annotations
 
-import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -90,6 +89,10 @@ class Integrator(ABC):
     variational: bool
     # Whether fast damped modes are at rest after one step.
     l_stable: ClassVar[bool] = False
+    # When the noise impulse of a step acts, see :class:`Midpoint`.
+    kick: Literal["left", "split", "held"] = "left"
+    # Whether a step's noise impulse acts after the step as a whole, by the fields at its start.
+    kicks_after: ClassVar[bool] = False
     # Options that the text names even at their defaults.
     named: ClassVar[tuple[str, ...]] = ()
 
@@ -125,12 +128,12 @@ class Integrator(ABC):
     @property
     def left(self) -> float:
         """The share of a step's noise impulse that acts before the step; the rest acts after it."""
-        return 1.0
+        return 0.5 if self.kick == "split" else 1.0
 
     @property
     def holds_noise(self) -> bool:
         """Whether the noise of a step is a force that is constant over it, instead of impulses at its ends."""
-        return False
+        return self.kick == "held"
 
     @property
     def drift_share(self) -> float:
@@ -256,11 +259,15 @@ class Compiled(Integrator):
     def state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
         """The q, p and v (n,) of the only path."""
 
-    @abstractmethod
     def kicked(
         self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
     ) -> Segment:
         """One step of the only path under a drift (n,), with a noise impulse (n,) or its first part."""
+        kicks = None
+        if impulse is not None:
+            kicks = np.zeros((1, 1, 2, impulse.size))
+            kicks[0, 0, 0] = self.left * impulse
+        return self.rollout_compiled(scene, state, command, scene.silence, drift[None, None], dt, kicks)[0]
 
     def rollout(self, scene: Scene, state: Run, commands: Commands, increments: Floats, dt: float) -> list[Segment]:
         if scene.noise.diffusion is not None:
@@ -488,19 +495,3 @@ def segments_of(nodes: RolloutArrays, reasons: Mapping[int, str], paths: Any = N
         failure = Failure(reasons[ended], float(nodes.quality[i, done, 0])) if ended in reasons else None
         segments.append(Segment(**own, statistics=statistics, failure=failure))
     return segments
-
-
-def first_nodes(q: Floats, p: Floats, v: Floats, energy: Floats, controls: int) -> list[Segment]:
-    """A segment of one node for each of P paths, from q, p and v (P, n) and energies (P,) at their starts."""
-    u, statistics = np.zeros((1, controls)), _no_statistics()
-    rows = (slice(i, i + 1) for i in range(len(q)))
-    return [Segment(q[row], p[row], v[row], u, energy[row], statistics) for row in rows]
-
-
-@functools.cache
-def _no_statistics() -> StepStatistics:
-    """The statistics of a first node, read-only."""
-    none, zero, halvings = np.zeros(1, dtype=np.int64), np.zeros(1), np.zeros(0, dtype=np.uint8)
-    for array in (none, zero, halvings):
-        array.setflags(write=False)
-    return StepStatistics(none, none, none, none, halvings, zero, zero, zero)

@@ -18,10 +18,9 @@ from varpin.integrators.base import (
     Run,
     Segment,
     drifts,
-    first_nodes,
     forces,
+    segments_of,
 )
-from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.trajectory import Trajectory
 
@@ -44,12 +43,10 @@ class _Explicit(Compiled):
         refuse_constraints(scene, self)
         if scene.custom is not None:
             scene.custom.check(q0, v0)
-        paths, n = q0.shape
-        run, nodes = self.begun(scene, q0, v0), new_nodes(paths, 1, n, scene.controls)
+        run, nodes = self.begun(scene, q0, v0), new_nodes(len(q0), 1, scene.robot.dof, scene.controls)
         if not run.paths.first_nodes(nodes):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
-        q, p, v, energy = (part[:, 0] for part in (nodes.q, nodes.p, nodes.v, nodes.energy))
-        return run, first_nodes(q, p, v, energy, scene.controls)
+        return run, segments_of(nodes, REASONS)
 
     def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
         return Run(core.ExplicitRollout.start(scene.core, self.method, q0, v0), q0.copy())
@@ -65,20 +62,6 @@ class _Explicit(Compiled):
     def state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
         """See :meth:`Compiled.state_of`; p is none of its own."""
         return state.paths.q[0], state.paths.q[0, :0], state.paths.v[0]
-
-    def kicked(
-        self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
-    ) -> Segment:
-        """See :meth:`Compiled.kicked`.
-
-        The noise impulse is a constant force over the step for explicit Euler, where this is equivalent, and a jump of
-        the velocity before the step for the other methods.
-        """
-        if impulse is not None and self.method is ExplicitMethod.euler:
-            drift = drift + impulse / dt
-        elif impulse is not None:
-            state.paths.v[0] += np.linalg.solve(mass(scene, state.paths.q[0]), impulse)
-        return self.rollout_compiled(scene, state, command, scene.silence, drift[None, None], dt)[0]
 
     def linearize(
         self, scene: Scene, trajectory: Trajectory, *, ramps: bool = False
@@ -104,11 +87,6 @@ class _Explicit(Compiled):
         return in_v
 
 
-def mass(scene: Scene, q: Floats) -> Floats:
-    """M(q) (n, n)."""
-    return lagrangian_jet(scene, q, np.zeros_like(q)).Lvv
-
-
 def accelerations(scene: Scene, q: Floats, v: Floats, force: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Accelerations (N, n) under constant forces, and their derivatives in q, v and force, each (N, n, n).
 
@@ -128,13 +106,19 @@ class ExplicitEuler(_Explicit):
 
     method: ClassVar[ExplicitMethod] = ExplicitMethod.euler
     order = 1
+    kicks_after = True
 
     def damped(self, z: Floats) -> tuple[Floats, Floats]:
-        # Noise adds to the velocity after the step.
         return 1.0 - z, np.ones_like(z)
 
+    def kicked(
+        self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
+    ) -> Segment:
+        # As a constant force over the step, which is the same.
+        drift = drift if impulse is None else drift + impulse / dt
+        return super().kicked(scene, state, command, drift, None, dt)
+
     def _jump(self, in_v: Floats) -> Floats:
-        # Noise adds to the velocity after the step.
         n = in_v.shape[2]
         return np.tile(np.eye(2 * n, n, -n), (len(in_v), 1, 1))
 

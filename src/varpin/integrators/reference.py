@@ -84,13 +84,8 @@ class Reference(Integrator):
             raise InputError(f"{self} integrates no noise: leave it out of the scene")
         if scene.custom is not None:
             scene.custom.check(q0, v0)
-        paths, n = q0.shape
-        run = ReferenceRun(
-            x=np.hstack([q0, v0]),
-            dynamics=ForwardDynamics(scene.core),
-            tried=0.0,
-        )
-        nodes = new_nodes(paths, 1, n, scene.controls)
+        run = ReferenceRun(x=np.hstack([q0, v0]), dynamics=ForwardDynamics(scene.core), tried=0.0)
+        nodes = new_nodes(len(q0), 1, scene.robot.dof, scene.controls)
         if not ExplicitRollout.start(scene.core, ExplicitMethod.runge_kutta, q0, v0).first_nodes(nodes):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
         return run, segments_of(nodes, REASONS)

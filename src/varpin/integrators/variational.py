@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 from abc import abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from varpin.core import (
     Tableau,
     constrained_derivatives,
 )
-from varpin.core.arrays import Commands, RolloutArrays
+from varpin.core.arrays import Commands, RolloutArrays, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
     Compiled,
@@ -26,8 +25,8 @@ from varpin.integrators.base import (
     Run,
     Segment,
     drifts,
-    first_nodes,
     forces,
+    segments_of,
     without_inputs,
     written,
 )
@@ -100,7 +99,6 @@ class Variational(Compiled):
 
     guard: Guard | None
     tolerance: float
-    kick: Literal["left", "split", "held"]
 
     variational = True
     reasons = REASONS
@@ -116,14 +114,6 @@ class Variational(Compiled):
         positive("tolerance", self.tolerance, "rounding units")
         if not is_one_of(self.kick, ("left", "split", "held")):
             raise InputError(f"kick must be 'left', 'split' or 'held', got {self.kick!r}")
-
-    @property
-    def left(self) -> float:
-        return 0.5 if self.kick == "split" else 1.0
-
-    @property
-    def holds_noise(self) -> bool:
-        return self.kick == "held"
 
     def damped(self, z: Floats) -> tuple[Floats, Floats]:
         """See :meth:`Integrator.damped`."""
@@ -193,8 +183,10 @@ class Variational(Compiled):
         if scene.custom is not None:
             scene.custom.check(q0, v0)
         run = self.begun(scene, q0, v0)
-        q, p, v, energy = run.paths.nodes()
-        return run, first_nodes(q, p, v, energy, scene.controls)
+        nodes = new_nodes(len(q0), 1, scene.robot.dof, scene.controls)
+        nodes.q[:, 0], nodes.p[:, 0], nodes.v[:, 0], nodes.energy[:, 0] = run.paths.nodes()
+        nodes.done[:] = 1
+        return run, segments_of(nodes, REASONS)
 
     def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
         """See :meth:`Compiled.begun`."""
@@ -221,12 +213,10 @@ class Variational(Compiled):
     def kicked(
         self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
     ) -> Segment:
-        held = None
-        if impulse is not None and self.holds_noise:
-            held = np.stack([impulse, np.zeros_like(impulse)])[None, None]
-        elif impulse is not None:
-            state.paths.kick(self.left * impulse[None])
-        return self.rollout_compiled(scene, state, command, scene.silence, drift[None, None], dt, held)[0]
+        if impulse is not None and scene.constraints and not self.holds_noise:
+            state.paths.kick(impulse[None])
+            impulse = None
+        return super().kicked(scene, state, command, drift, impulse, dt)
 
     def linearize(
         self, scene: Scene, trajectory: Trajectory, *, ramps: bool = False
@@ -389,7 +379,6 @@ def _along(scene: Scene, q: Floats) -> Floats:
     return found
 
 
-@functools.lru_cache(maxsize=256)
 def _core_guards(given: Guard | None, balance: float = 1.0, budget: float = 1.0) -> Guards:
     guard = given or Guard(max_halvings=0)
     return Guards.make(

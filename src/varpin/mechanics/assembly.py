@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import numpy as np
 
 from varpin.arrays import Floats
@@ -46,11 +48,15 @@ def assemble(scene: Scene, q: JointValues) -> Floats:
         return start
     try:
         return nearest(scene, start)
-    except AssemblyError:
-        around = _reached_around(scene, start, _root_of_mass(scene, start))
-        if around is None:
-            raise
-        return around
+    except AssemblyError as error:
+        failure = error
+    root, rng = _root_of_mass(scene, start), np.random.default_rng(0)
+    for size in np.linspace(0.1, _FARTHEST, _RESTARTS):
+        found = _polished(scene, _reached(scene, start + size * rng.normal(size=start.size), root), root)
+        with contextlib.suppress(AssemblyError):
+            _require_kept(scene, found)
+            return found
+    raise failure
 
 
 def nearest(scene: Scene, q: Floats) -> Floats:
@@ -176,19 +182,6 @@ def _reached(scene: Scene, q: Floats, root: Floats) -> Floats:
             if damping > 1e12:
                 break
     return q
-
-
-def _reached_around(scene: Scene, start: Floats, root: Floats) -> Floats | None:
-    """A configuration that satisfies the constraints, searched for from random points ever farther from ``start``."""
-    rng = np.random.default_rng(0)
-    for size in np.linspace(0.1, _FARTHEST, _RESTARTS):
-        q = _polished(scene, _reached(scene, start + size * rng.normal(size=start.size), root), root)
-        try:
-            _require_kept(scene, q)
-        except AssemblyError:
-            continue
-        return q
-    return None
 
 
 def _polished(scene: Scene, q: Floats, root: Floats) -> Floats:

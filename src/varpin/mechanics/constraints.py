@@ -23,7 +23,7 @@ from varpin.core.arrays import Carried, ConstraintRows, CustomRows, Product, Tie
 from varpin.errors import InputError
 from varpin.mechanics.forces import Described, End, Point, ends_of, shown
 from varpin.model import Robot
-from varpin.support.checks import as_floats, count, finite_array, positive, returned, rotation_matrix, tuple_of, word
+from varpin.support.checks import as_floats, count, finite_array, positive, returned, rotation_matrix, word
 from varpin.support.differences import slopes
 
 _AXES = "xyz"
@@ -292,16 +292,6 @@ class CustomConstraint(Constraint):
 
 class CustomConstraintError(InputError):
     """A function of a custom constraint raised, or returned a wrong type, shape or value."""
-
-
-def constraints_of(given: Constraint | Sequence[Constraint]) -> tuple[Constraint, ...]:
-    """A constraint or a sequence of them as a tuple.
-
-    Raises:
-        InputError: Something else is given.
-    """
-    note = "; those of a plan, such as limits and obstacles, belong to varpin.OptimalControlProblem(constraints=)"
-    return tuple_of("constraints", given, Constraint, note)
 
 
 def joined(bound: Sequence[Bound]) -> tuple[Bound, NDArray[np.int64]]:

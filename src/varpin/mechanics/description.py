@@ -31,7 +31,7 @@ def description_constraints(robot: Robot) -> tuple[Constraint, ...]:
 
 def _closure(closure: Closure, robot: Robot) -> Constraint | None:
     (a, here), (b, there) = closure.a, closure.b
-    (body, *at), (other, *on) = (place_of_frame(robot.free_model, name, robot.name) for name in (a, b))
+    (body, *at), (other, *on) = (place_of_frame(robot.model, name, robot.name) for name in (a, b))
     if body == other:
         miss = (pin.SE3(*at) * here).actInv(pin.SE3(*on) * there)
         turned = np.abs(pin.log3(miss.rotation)).max() if closure.turns else 0.0

@@ -10,8 +10,9 @@ frame's axes (3,) [m]), or, for forces with two ends, a point in world axes (3,)
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
@@ -23,10 +24,12 @@ from varpin.arrays import Floats, Mask
 from varpin.core import coupling_kinds, element_kinds
 from varpin.core.arrays import Coupling, Element
 from varpin.errors import InputError
-from varpin.model import Robot
+from varpin.model import Robot, degrees_hint
 from varpin.model.tree import place_of_frame
-from varpin.support.checks import JointValues, as_floats, finite_array, joint_array, rotation_matrix, tuple_of, word
+from varpin.support.checks import JointValues, as_floats, finite_array, joint_array, rotation_matrix, word
 from varpin.support.frozen import Frozen
+
+logger = logging.getLogger(__name__)
 
 # A frame name or (frame name, point in the frame's axes); a Point may also be a point in world axes.
 FramePoint: TypeAlias = str | tuple[str, ArrayLike]
@@ -121,11 +124,19 @@ class JointForce(Force):
             none = _LIMITS.get(name, 0.0)
             values = joint_array(name, getattr(self, name), robot.joint_names, uniform=True, absent=none)
             if name in _LIMITS:
-                _refuse(name, values, np.isnan(values) | (values == -none), f"must be a number, or {none} for none")
-            numbers[name] = values if name in _SIGNED + _POSITIVE else not_negative(name, values)
+                refuse_where(
+                    name, values, np.isnan(values) | (values == -none), f"must be a number, or {none} for none"
+                )
+            if name not in _SIGNED + _POSITIVE:
+                refuse_where(name, values, values < 0.0, "must be >= 0")
+            numbers[name] = values
         acts = self.acts(numbers, robot)
         for name in numbers.keys() & set(_POSITIVE):
-            _refuse(name, numbers[name], acts & ~(numbers[name] > 0.0), "must be > 0")
+            refuse_where(name, numbers[name], acts & ~(numbers[name] > 0.0), "must be > 0")
+        for name in (name for name in _SIGNED if name in numbers):
+            places = np.where(acts & np.isfinite(numbers[name]), numbers[name], 0.0)
+            if units := degrees_hint(robot, f"{name} of the {type(self).__name__}", places):
+                logger.warning(units)
         table = np.column_stack([numbers[name] for name in self.columns or numbers])
         return tuple(Element(type(self).__name__, int(c), tuple(table[c].tolist())) for c in np.flatnonzero(acts))
 
@@ -198,7 +209,7 @@ class CoulombFriction(JointForce):
         breakaway = numbers.setdefault("breakaway", level)
         numbers.setdefault("stribeck_velocity", np.ones_like(level))
         acts = np.maximum(level, breakaway) > 0.0
-        _refuse("breakaway", breakaway, acts & (breakaway < level), "must be at least the level")
+        refuse_where("breakaway", breakaway, acts & (breakaway < level), "must be at least the level")
         return np.asarray(acts)
 
 
@@ -238,7 +249,7 @@ class JointStop(JointForce):
                 f"JointStop: {robot.name} has no position limits for {', '.join(map(repr, endless.tolist()))}: give "
                 "lower= and upper="
             )
-        _refuse("lower", lower, acts & ~(lower < upper), "must be below the upper end")
+        refuse_where("lower", lower, acts & ~(lower < upper), "must be below the upper end")
         return np.asarray(acts)
 
 
@@ -404,7 +415,7 @@ def point_of(name: str, point: Any, robot: Robot) -> tuple[int, Floats, Floats]:
             )
         return -1, np.eye(3), finite_array(name, point, (3,))
     place = finite_array(f"{name}, the place in frame {frame!r},", offset, (3,))
-    body, turned, at = place_of_frame(robot.free_model, frame, robot.name)
+    body, turned, at = place_of_frame(robot.model, frame, robot.name)
     return body, turned, at + turned @ place
 
 
@@ -484,22 +495,8 @@ def keeps_energy(coupling: Coupling) -> bool:
     return not COUPLINGS[coupling.kind].force
 
 
-def forces_of(given: Force | Sequence[Force]) -> tuple[Force, ...]:
-    """A force or a sequence of them as a tuple.
-
-    Raises:
-        InputError: Something else is given.
-    """
-    return tuple_of("forces", given, Force)
-
-
-def not_negative(name: str, values: Floats) -> Floats:
-    """``values`` for each joint (n,) if none is negative; an InputError otherwise."""
-    return _refuse(name, values, values < 0.0, "must be >= 0")
-
-
-def _refuse(name: str, values: Floats, wrong: Mask, what: str) -> Floats:
+def refuse_where(name: str, values: Floats, wrong: Mask, what: str) -> None:
+    """Refuse the first of the values (n,) that is wrong."""
     if wrong.any():
         c = int(np.argmax(wrong))
         raise InputError(f"{name}[{c}] is {values[c]}; it {what}")
-    return values

@@ -47,11 +47,11 @@ def _of_pinocchio(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
     if missing:
         raise InputError(f"backend='pinocchio' has no {', '.join(sorted(missing))}; backend='compiled' has")
     robot = scene.robot
-    model = robot.free_model.copy()
+    model = robot.model.copy()
     model.gravity = pin.Motion(scene.gravity, np.zeros(3))
-    free = rigid_bodies(model, robot.free_positions(q), robot.free_velocities(v))
+    free = rigid_bodies(model, robot.configuration(q), robot.velocity(v))
     # Jacobian of the free joints in the coordinates; mimic joints make it more than a permutation.
-    G = robot.free_velocities(np.eye(robot.dof)).T
+    G = robot.velocity(np.eye(robot.dof)).T
     rotors = scene.armature - robot.tree.armature
     springs = [(q[each.coordinate], *each.values) for each in of_kind(scene.elements, "JointSpring")]
     potential = sum(0.5 * stiffness * (at - rest) ** 2 for at, stiffness, rest in springs)

@@ -33,7 +33,6 @@ class Required:
         locked: Joints that are locked, and their positions [rad or m]: their links are part of others.
         idle: Joints that stay at rest and are left out, and their positions [rad or m].
         parts: The computed joints in independent groups.
-        coupled: Why groups are planned together although they share no inertia; empty if they are not.
         terms: Description of each possible effect, by its name.
     """
 
@@ -41,7 +40,6 @@ class Required:
     locked: Mapping[str, float | tuple[float, ...]]
     idle: Mapping[str, float]
     parts: tuple[tuple[str, ...], ...]
-    coupled: str
     terms: Mapping[str, str]
 
     @property
@@ -58,8 +56,6 @@ class Required:
                 rows.append((title, listed(f"{joint} at {at}" for joint, at in joints.items())))
         if len(self.parts) > 1:
             rows.append(("independent", "; ".join(listed(part) for part in self.parts)))
-        if self.coupled:
-            rows.append(("coupled", self.coupled))
         return [*rows, *self.terms.items()]
 
     def _repr_html_(self) -> str:
@@ -81,17 +77,9 @@ def requirements(
 
 def report(part: Scene, whole: Scene, idle: Mapping[str, float]) -> Required:
     """The report on ``part``, which is ``whole`` without its ``idle`` joints."""
-    names, group = part.robot.joint_names, part.group
-    parts = [tuple(name for name, own in zip(names, group, strict=True) if own == label) for label in np.unique(group)]
-    coupled = "the scene has constraints" if part.constraints and len(parts) > 1 else ""
-    return Required(
-        joints=names,
-        locked=whole.robot.locked,
-        idle=idle,
-        parts=(names,) if coupled else tuple(parts),
-        coupled=coupled,
-        terms=part.terms,
-    )
+    names = np.array(part.robot.joint_names)
+    parts = tuple(tuple(names[part.group == label].tolist()) for label in np.unique(part.group))
+    return Required(tuple(names.tolist()), whole.robot.locked, idle, parts, part.terms)
 
 
 def idle_joints(

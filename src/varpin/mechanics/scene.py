@@ -9,6 +9,7 @@ import logging
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import count
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats, Integers
 from varpin.core import Mechanism
-from varpin.core.arrays import ConstraintRows, Coupling, Diffusion, Element, Tied
+from varpin.core.arrays import Coupling, Diffusion, Element, Tied
 from varpin.errors import InputError
 from varpin.finding import Told
 from varpin.mechanics.constraints import (
@@ -25,27 +26,26 @@ from varpin.mechanics.constraints import (
     Constraint,
     CustomConstraint,
     KinematicInput,
-    constraints_of,
     joined,
 )
 from varpin.mechanics.custom import CustomForce, CustomForces
 from varpin.mechanics.description import description_constraints
 from varpin.mechanics.forces import (
+    ELEMENTS,
     CoulombFriction,
     Force,
     JointDamper,
     JointSpring,
     JointStop,
     dissipates,
-    forces_of,
     keeps_energy,
-    not_negative,
     of_kind,
+    refuse_where,
 )
 from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, bind, models_of
-from varpin.model import Robot, degrees_hint, require_robot
+from varpin.model import Robot, require_robot
 from varpin.model.tree import block_ends, mechanism, path_coordinates
-from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array
+from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array, tuple_of
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
 from varpin.support.weak import Weak
@@ -166,10 +166,15 @@ class Scene(Frozen):
         values["constraints"] = given_constraints(robot, constraints)
         bound, order = joined([constraint.bind(robot) for constraint in values["constraints"]])
         inputs = [tie.follower for tie in filter(_is_input, bound.rows.ties)]
-        driven = _driven(robot, _actuation(robot, actuation), of_kind(values["elements"], "PositionServo"), inputs)
+        servos = of_kind(values["elements"], "PositionServo")
+        driven = _driven(robot, _actuation(robot, actuation), servos, inputs)
         values["actuation"], bound = _with_rates(driven, bound)
         models = models_of(noise)
-        _refuse_noisy_servos(models, values["elements"], robot)
+        if servos and any(isinstance(model, ControlNoise) for model in models):
+            raise InputError(
+                "ControlNoise is proportional to forces, but the control of joint "
+                f"{robot.joint_names[servos[0].coordinate]!r} is the position of its servo: take AdditiveNoise"
+            )
         # Kinematic inputs absorb all forces on their joints.
         forced = values["actuation"].copy()
         forced[inputs] = 0.0
@@ -384,11 +389,6 @@ class Scene(Frozen):
         return np.array_equal(self.actuation, np.eye(self.robot.dof))
 
     @cached_property
-    def allocation(self) -> Floats:
-        """Matrix (m, n) of the smallest controls that give joint forces, or come closest: the pseudoinverse."""
-        return np.asarray(np.linalg.pinv(self.actuation), dtype=np.float64)
-
-    @cached_property
     def controls(self) -> int:
         """m, the number of controls."""
         return int(self.actuation.shape[1])
@@ -438,7 +438,7 @@ class Scene(Frozen):
     @cached_property
     def core(self) -> Mechanism:
         """The scene in the compiled core, without noise fields that only Python can evaluate."""
-        fields = self.diffusion
+        fields, rows = self.diffusion, self.bound_constraints.rows
         return mechanism(
             self.robot.tree,
             periodic=self._periodic(),
@@ -449,7 +449,12 @@ class Scene(Frozen):
             gravity=self.gravity,
             forces=self.elements,
             couplings=self.couplings,
-            constraints=_unowned(self.bound_constraints.rows),
+            # The scene owns the functions of users.
+            constraints=rows._replace(
+                customs=tuple(
+                    row._replace(value=Weak(row.value), curvature=Weak(row.curvature)) for row in rows.customs
+                )
+            ),
             custom=None if self.custom is None else Weak(self.custom),
             actuation=self.actuation,
             constant=fields.constant,
@@ -487,11 +492,6 @@ class Scene(Frozen):
         return bounds
 
     @cached_property
-    def direct_efforts(self) -> bool:
-        """Whether the motors' forces are those of the controls: there are neither servos nor kinematic inputs."""
-        return not (self.servo_joints or self.inputs)
-
-    @cached_property
     def diffusion(self) -> Diffusion:
         """The noise fields that the core can evaluate; empty if some need Python."""
         return self.noise.diffusion or bind((), self.actuation, ()).arrays
@@ -519,7 +519,7 @@ class Scene(Frozen):
             rows.append(("constraints.between", [product.factor, product.constant, *places]))
         rows += [("constraints.ties", (t.follower, t.leader, t.rate, *t.coefficients)) for t in constraints.ties]
         rows += [("constraints.custom", [own.rows]) for own in constraints.customs]
-        values |= _tables(rows)
+        values |= {kind: np.zeros((0, 0)) for kind in ELEMENTS if kind not in _SUMMED} | _tables(rows)
         if self.noise.diffusion is not None:
             fields = self.noise.diffusion
             values |= {"noise.constant": fields.constant, "noise.control": np.linalg.norm(fields.control, axis=2)}
@@ -601,13 +601,6 @@ def joints_with(values: ArrayLike, names: Sequence[str]) -> str:
     """The joints with values other than 0, in words."""
     acting = [name for name, value in zip(names, np.asarray(values).tolist(), strict=True) if value]
     return "on every joint" if acting and len(acting) == len(names) else f"on {', '.join(acting)}" if acting else "none"
-
-
-def _unowned(rows: ConstraintRows) -> ConstraintRows:
-    """Rows with weak references to their functions, which the scene owns."""
-    return rows._replace(
-        customs=tuple(row._replace(value=Weak(row.value), curvature=Weak(row.curvature)) for row in rows.customs)
-    )
 
 
 def _tables(rows: Sequence[tuple[str, Sequence[float]]]) -> dict[str, Floats]:
@@ -697,7 +690,7 @@ def require_scene(scene: object) -> Scene:
 def _gravity(gravity: ArrayLike | bool, robot: Robot) -> Floats:
     """Gravity (3,) [m/s^2] from the argument of a scene."""
     if isinstance(gravity, bool | np.bool_):
-        return finite_array("gravity of the robot", robot.free_model.gravity.linear, (3,)) if gravity else np.zeros(3)
+        return finite_array("gravity of the robot", robot.model.gravity.linear, (3,)) if gravity else np.zeros(3)
     given = as_floats("gravity", gravity)
     if given.ndim == 0 and np.isfinite(given):
         meant = f"({', '.join(f'{g:g}' for g in (0.0, 0.0, -abs(float(given))))})" if given else "False"
@@ -725,9 +718,12 @@ def given_constraints(
     """The constraints from the argument of a scene, with those of the robot's description in place of ``"robot"``."""
     parts: Any = ("robot",) if is_one_of(given, ("robot",)) else () if given is None else given
     if asked := isinstance(parts, list | tuple) and any(is_one_of(part, ("robot",)) for part in parts):
+        if [is_one_of(part, ("robot",)) for part in parts].count(True) > 1:
+            raise InputError("constraints has 'robot' twice")
         own = description_constraints(robot)
         parts = [each for part in parts for each in (own if is_one_of(part, ("robot",)) else (part,))]
-    found = constraints_of(parts)
+    note = "; those of a plan, such as limits and obstacles, belong to varpin.OptimalControlProblem(constraints=)"
+    found = tuple_of("constraints", parts, Constraint, note)
     # Kinematic inputs alone are no decision on those of the description.
     decided = given is not None and not (found and all(isinstance(part, KinematicInput) for part in found))
     gives = bool(robot.equalities)
@@ -744,7 +740,7 @@ def _forces(
     rest: JointValues,
 ) -> dict[str, Any]:
     """The attributes of a scene that follow from its forces, by name."""
-    given = forces_of(forces)
+    given: tuple[Force, ...] = tuple_of("forces", forces, Force)
     kinds = {type(force) for force in given}
 
     def resistance(name: str, value: Any, own: Floats, *, decided: bool) -> Floats:
@@ -753,35 +749,26 @@ def _forces(
             raise InputError(f"{name} must be numbers, or 'robot' for those of the robot's description, got {value!r}")
         _warn_of_description(robot, name, name, gives=bool(own.any()), asked=asked, decided=decided)
         values = own if asked else 0.0 if value is None else value
-        return not_negative(name, joint_array(name, values, robot.joint_names, uniform=True))
+        return joint_array(name, values, robot.joint_names, uniform=True)
 
     viscous = resistance("damping", damping, robot.damping, decided=damping is not None or JointDamper in kinds)
     # Numbers for the damping are a decision on the dry friction, too.
     decided = friction is not None or not (damping is None or is_one_of(damping, ("robot",)))
     dry = resistance("friction", friction, robot.friction, decided=decided or CoulombFriction in kinds)
-    stiff = not_negative("stiffness", joint_array("stiffness", stiffness, robot.joint_names, uniform=True))
-    slack = joint_array("rest", rest, robot.joint_names, uniform=True)
-    positions = {"rest": slack if stiff.any() else np.zeros(robot.dof)}
-    given = (
-        *([JointSpring(stiff, slack)] if stiff.any() else []),
-        *([JointDamper(viscous)] if viscous.any() else []),
-        *([CoulombFriction(dry)] if dry.any() else []),
-        *given,
-    )
-    bound = [each for force in given for each in force.bind(robot)]
+    # Its force would call it the level.
+    refuse_where("friction", dry, dry < 0.0, "must be >= 0")
+    short: tuple[Force, ...] = (JointSpring(stiffness, rest), JointDamper(viscous), CoulombFriction(dry))
+    acting = [(force, parts) for force in short if (parts := force.bind(robot))]
+    acting += [(force, force.bind(robot)) for force in given]
+    given = tuple(force for force, _ in acting)
+    bound = [each for _, parts in acting for each in parts]
     elements = [each for each in bound if isinstance(each, Element)]
-    for side, name in enumerate(("lower", "upper")):
-        ends = positions[f"the {name} end of the JointStop"] = np.zeros(robot.dof)
-        for element in of_kind(elements, "JointStop"):
-            ends[element.coordinate] = np.nan_to_num(element.values[side], posinf=0.0, neginf=0.0)
-    for name, values in positions.items():
-        if units := degrees_hint(robot, name, values):
-            logger.warning(units)
     own_code = tuple(force for force in given if isinstance(force, CustomForce))
     total = {kind: np.zeros(robot.dof) for kind in _SUMMED}
     for element in elements:
         if element.kind in total:
             total[element.kind][element.coordinate] += element.values[0]
+    slack = np.zeros(robot.dof)
     for c in np.flatnonzero(total["JointSpring"]):
         springs = [element.values for element in of_kind(elements, "JointSpring") if element.coordinate == c]
         first = springs[0][1]
@@ -796,16 +783,6 @@ def _forces(
         "rest": slack,
         "armature": robot.tree.armature + total["Armature"],
     }
-
-
-def _refuse_noisy_servos(models: Sequence[Noise], elements: Sequence[Element], robot: Robot) -> None:
-    """Refuse noise in proportion to the controls of servos: these are positions, whose zero is arbitrary."""
-    servos = of_kind(elements, "PositionServo")
-    if servos and any(isinstance(model, ControlNoise) for model in models):
-        raise InputError(
-            f"ControlNoise is proportional to forces, but the control of joint "
-            f"{robot.joint_names[servos[0].coordinate]!r} is the position of its servo: take AdditiveNoise"
-        )
 
 
 def _is_input(tie: Tied) -> bool:
@@ -837,16 +814,10 @@ def _driven(robot: Robot, actuation: Floats, servos: Sequence[Element], inputs: 
 
 def _with_rates(actuation: Floats, bound: Bound) -> tuple[Floats, Bound]:
     """The actuation with a column of zeros for the velocity of each cubic input, and the ties with these columns."""
-    m, ties = actuation.shape[1], list(bound.rows.ties)
-    cubic = [k for k, tie in enumerate(ties) if tie.rate >= 0]
-    if not cubic:
-        return actuation, bound
-    for k, index in enumerate(cubic):
-        ties[index] = ties[index]._replace(rate=m + k)
-    return (
-        np.hstack([actuation, np.zeros((len(actuation), len(cubic)))]),
-        bound._replace(rows=bound.rows._replace(ties=tuple(ties))),
-    )
+    columns = count(actuation.shape[1])
+    ties = tuple(tie._replace(rate=next(columns)) if tie.rate >= 0 else tie for tie in bound.rows.ties)
+    added = np.zeros((len(actuation), next(columns) - actuation.shape[1]))
+    return np.hstack([actuation, added]), bound._replace(rows=bound.rows._replace(ties=ties))
 
 
 def _actuation(robot: Robot, actuation: ArrayLike | Sequence[str] | None) -> Floats:

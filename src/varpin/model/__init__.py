@@ -2,8 +2,8 @@
 
 from varpin.model.chain import planar_chain as planar_chain
 from varpin.model.combination import combine as combine
+from varpin.model.inertia import Payload as Payload
 from varpin.model.loading import load_robot as load_robot
-from varpin.model.payload import Payload as Payload
 from varpin.model.robot import Robot as Robot
 from varpin.model.robot import check_inertia as check_inertia
 from varpin.model.robot import geometry as geometry

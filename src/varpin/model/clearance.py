@@ -163,17 +163,11 @@ class Obstacle(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class _Body:
-    """A body in the world or on a link.
+    """A body in the world or on a link."""
 
-    Attributes:
-        solid: The obstacle; or the link's capsule in its own axes, with the link's name.
-        kinematics: Kinematics of the link; None in the world.
-        shifts: Displacements of the obstacle at the times in question (K, 3) [m].
-    """
-
-    solid: Obstacle
-    kinematics: FrameKinematics | None = None
-    shifts: Floats = field(default_factory=lambda: np.zeros((1, 3)))
+    solid: Obstacle  # or the link's capsule in its own axes, with the link's name
+    kinematics: FrameKinematics | None = None  # of the link; None in the world
+    shifts: Floats = field(default_factory=lambda: np.zeros((1, 3)))  # of the obstacle at the times (K, 3) [m]
 
 
 class Clearance(Frozen):
@@ -248,11 +242,7 @@ _Placed = tuple[Floats, Floats, Floats]
 
 
 def _round(one: Obstacle, other: Obstacle, here: _Placed, there: _Placed) -> tuple[Floats, Floats, Floats, Floats]:
-    """Distances of two capsules: that of their axes less both radii (Ericson, "Real-time collision detection", 5.1.9).
-
-    Returns:
-        What :meth:`Clearance._measured` returns, for one pair.
-    """
+    """:meth:`Clearance._measured` of one pair of capsules (Ericson, "Real-time collision detection", 5.1.9)."""
     p1, p2 = here[0], there[0]
     d1, d2, r = here[1] - p1, there[1] - p2, p1 - p2
     a, e, b = ((x * y).sum(axis=1) for x, y in ((d1, d1), (d2, d2), (d1, d2)))
@@ -339,7 +329,7 @@ def clearance(
     names = list(dict.fromkeys([*fitted, *given])) if links is None else list(links)
     bodies = []
     for name in names:
-        body, _, _ = place_of_frame(robot.free_model, name, robot.name)
+        body, _, _ = place_of_frame(robot.model, name, robot.name)
         if name in given:
             begin, end, radius = given[name]
             shape = (
@@ -353,7 +343,7 @@ def clearance(
             raise InputError(f"link {name!r} of robot {robot.name!r} has no shape; give capsules={{{name!r}: ...}}")
         # A link that no joint moves is fixed in the world.
         if body < 0:
-            _, R, p = place_of_frame(robot.free_model, name, robot.name)
+            _, R, p = place_of_frame(robot.model, name, robot.name)
             shape = R @ shape[0] + p, R @ shape[1] + p, shape[2]
         solid = Obstacle(name, *shape, None, np.eye(3))
         bodies.append((body, _Body(solid, None if body < 0 else frame_kinematics(robot, name))))
@@ -393,10 +383,10 @@ def _disabled(robot: Robot, srdf: Path | None) -> set[frozenset[str]]:
     """Pairs of links that an SRDF file excludes from collision checks."""
     if srdf is None:
         return set()
-    root = read_xml(srdf)
+    root = read_xml(srdf, kind="SRDF")
     pairs = {frozenset((e.get("link1", ""), e.get("link2", ""))) for e in root.findall("disable_collisions")}
     links = {link for pair in pairs for link in pair}
-    if links.isdisjoint(frame.name for frame in robot.free_model.frames):
+    if links.isdisjoint(frame.name for frame in robot.model.frames):
         raise InputError(f"{srdf} leaves out no pair of links of robot {robot.name!r}: give the robot's own SRDF")
     return pairs
 
@@ -408,7 +398,7 @@ def _vertices(robot: Robot) -> dict[str, Floats]:
     for _, what in faulty.values():
         raise RobotError(what)
     for shape in shapes.geometryObjects:
-        frame = robot.free_model.frames[shape.parentFrame]
+        frame = robot.model.frames[shape.parentFrame]
         place = frame.placement.inverse()
         found.setdefault(frame.name, []).append(shape_points(shape) @ place.rotation.T + place.translation)
     return {name: np.vstack(parts) for name, parts in found.items()}

@@ -70,7 +70,7 @@ def combine(
     ties = tuple(
         tie
         for robot, prefix, place in parts
-        for tie in rebuild(robot.free_model, onto=model, prefix=prefix, place=place).ties(robot.ties)
+        for tie in rebuild(robot.model, onto=model, prefix=prefix, place=place).ties(robot.ties)
     )
     pairs = list(zip(robots, given, strict=True))
     return Robot(
@@ -93,7 +93,7 @@ def combine(
 
 
 def _names(robot: Robot) -> set[str]:
-    return {*list(robot.free_model.names)[1:], *(frame.name for frame in list(robot.free_model.frames)[1:])}
+    return {*list(robot.model.names)[1:], *(frame.name for frame in list(robot.model.frames)[1:])}
 
 
 def _twice(robots: Sequence[Robot], prefixes: Sequence[str]) -> list[str]:

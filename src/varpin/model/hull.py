@@ -26,15 +26,10 @@ _EDGES = 254
 
 @dataclass(frozen=True, eq=False)
 class Hull(Frozen):
-    """A convex polyhedron. Made by :func:`hull_around`.
+    """A convex polyhedron. Made by :func:`hull_around`."""
 
-    Attributes:
-        points: Its vertices (P, 3) [m].
-        faces: Indices of the vertices of its triangles (F, 3), anticlockwise from outside.
-    """
-
-    points: Floats
-    faces: NDArray[np.int64]
+    points: Floats  # its vertices (P, 3) [m]
+    faces: NDArray[np.int64]  # indices of the vertices of its triangles (F, 3), anticlockwise from outside
 
     @property
     def sides(self) -> Floats:

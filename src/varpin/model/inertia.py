@@ -1,14 +1,24 @@
-"""Checks of masses and inertias."""
+"""Masses and inertias: their faults, those of payloads, and those of shapes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
-from varpin.model.urdf import Inertial
+from varpin.errors import InputError, RobotError
+from varpin.model.mimic import joint_index
+from varpin.model.tree import frame_index
+from varpin.model.urdf import Inertial, build_shapes, listed, read_urdf
+from varpin.support.checks import as_floats, finite_array, positive, require_finite
+
+if TYPE_CHECKING:
+    from varpin.model.robot import Robot
 
 # Relative tolerance of the triangle inequality. A thin plate satisfies it with equality, and misses it by about this
 # much if its numbers are rounded.
@@ -17,6 +27,8 @@ TRIANGLE_TOLERANCE = 1e-3
 POINT = 1e-12
 # No link of an arm, or of a crane, weighs more [kg]; a link of 100 g whose mesh is in mm does, 1e9 times too much.
 HEAVY = 1e6
+# A mesh is closed if the norm of its summed directed areas is at most this share of its area.
+_CLOSED = 1e-3
 
 
 def principal_moments(inertia: Floats) -> Floats:
@@ -78,3 +90,106 @@ def inertials_of(model: pin.Model) -> list[Inertial]:
     links = {frame.parentJoint: frame.name for frame in reversed(model.frames) if frame.type == pin.FrameType.BODY}
     bodies = list(enumerate(model.inertias))[1:]
     return [Inertial(links.get(j, model.names[j]), x.mass, np.array(x.lever), np.array(x.inertia)) for j, x in bodies]
+
+
+@dataclass(frozen=True, eq=False)
+class Payload:
+    """A rigid body fastened to a frame of the robot.
+
+    Attributes:
+        frame: Name of the frame.
+        mass: Mass [kg], > 0.
+        center: Centre of mass (3,) in the frame [m].
+        inertia: Inertia about the centre of mass, in the frame's axes [kg m^2]: 0 for a point mass, (3,) principal
+            moments along the axes, or (3, 3).
+    """
+
+    frame: str
+    mass: float
+    center: ArrayLike = (0.0, 0.0, 0.0)
+    inertia: ArrayLike = 0.0
+
+    def __post_init__(self) -> None:
+        positive("payload mass", self.mass, "kg")
+        finite_array("payload center", self.center, (3,))
+        self.moments()
+
+    def moments(self) -> Floats:
+        """The inertia as a matrix (3, 3).
+
+        Raises:
+            InputError: No rigid body has it: it is not symmetric, is negative, or violates the triangle inequality.
+        """
+        given = require_finite("payload inertia", as_floats("payload inertia", self.inertia))
+        if given.shape not in ((), (3,), (3, 3)) or (given.ndim == 0 and given != 0.0):
+            raise InputError(
+                "payload inertia must be 0, three principal moments or a matrix (3, 3), got "
+                + (f"{given:g}" if given.ndim == 0 else f"shape {given.shape}")
+            )
+        matrix = given * np.eye(3) if given.ndim < 2 else given
+        size = float(np.abs(matrix).max())
+        if np.abs(matrix - matrix.T).max() > 1e-9 * size:
+            raise InputError("payload inertia must be symmetric")
+        _, sentence = fault(self.frame, float(self.mass), principal_moments(matrix))
+        if sentence:
+            raise InputError(f"payload inertia: {sentence}")
+        return np.asarray(matrix)
+
+
+def carry(model: pin.Model, payload: Sequence[Payload], robot: str) -> None:
+    """Add payloads to the links of ``model``."""
+    for part in payload:
+        if not isinstance(part, Payload):
+            raise InputError(f"payload must be a varpin.Payload or a sequence of them, got {type(part).__name__}")
+        frame = model.frames[frame_index(model, part.frame, robot)]
+        if frame.parentJoint == 0:
+            raise InputError(
+                f"payload of robot {robot!r}: frame {part.frame!r} belongs to the base, which does not move"
+            )
+        body = pin.Inertia(float(part.mass), np.array(part.center, dtype=float), part.moments())
+        model.appendBodyToJoint(frame.parentJoint, body, frame.placement)
+
+
+def _gaps(shape: pin.coal.CollisionGeometry) -> float:
+    """Norm of the sum of a mesh's directed areas as a share of its area: 0 for a closed mesh."""
+    if not isinstance(shape, pin.coal.BVHModelBase):
+        return 0.0
+    corners = np.asarray(shape.vertices(), dtype=float)[
+        [[triangle[k] for k in range(3)] for triangle in map(shape.tri_indices, range(shape.num_tris))]
+    ]
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = float(np.linalg.norm(areas, axis=1).sum())
+    return float(np.linalg.norm(areas.sum(axis=0))) / total if total > 0.0 else 1.0
+
+
+def with_mesh_inertias(robot: Robot, density: float) -> Robot:
+    """Give the links of a URDF that have no inertia that of their visual shapes, at uniform density [kg/m^3]."""
+    density = positive("density", density, "kg/m^3")
+    if robot.urdf is None:
+        raise InputError(f"inertia='meshes' needs a URDF file; {robot.name!r} does not come from one")
+    urdf = read_urdf(robot.urdf, robot.expanded)
+    known = {inertial.link for inertial in robot.inertials}
+    shapes, faults = build_shapes(urdf, robot.package_dirs)
+    for link, fault in faults.items():
+        if link not in known:
+            raise RobotError(fault)
+    model, index = robot.model.copy(), joint_index(robot.model)
+    masses: dict[str, float] = {}
+    for shape in shapes.geometryObjects:
+        link = urdf.model.frames[shape.parentFrame].name
+        if link in known:
+            continue
+        volume = float(shape.geometry.computeVolume())
+        if not (np.isfinite(volume) and volume > 0.0) or _gaps(shape.geometry) > _CLOSED:
+            raise RobotError(
+                f"link {link!r}: {shape.meshPath or shape.name} bounds no volume ({volume:g} m^3): its triangles leave "
+                "gaps or face inwards; give the link an <inertial>"
+            )
+        center = np.asarray(shape.geometry.computeCOM(), dtype=float).reshape(3)
+        moments = np.asarray(shape.geometry.computeMomentofInertiaRelatedToCOM(), dtype=float)
+        body = pin.Inertia(density * volume, center, 0.5 * density * (moments + moments.T))
+        model.appendBodyToJoint(index.get(urdf.model.names[shape.parentJoint], 0), body, shape.placement)
+        masses[link] = masses.get(link, 0.0) + density * volume
+    weighed = listed((f"{link!r} {mass:.3g} kg" for link, mass in masses.items()), "links")
+    remark = f"links without an inertia have that of their shapes at {density:g} kg/m^3: {weighed}"
+    return robot.changed(model=model, remarks=(*robot.remarks, remark)) if masses else robot

@@ -25,13 +25,9 @@ _BODY = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio"
 
 @dataclass(frozen=True, eq=False)
 class Links(Frozen):
-    """Some bodies of a robot's tree with all their ancestors, each on one joint.
+    """Some bodies of a robot's tree with all their ancestors, each on one joint."""
 
-    Attributes:
-        tree: The tree; what it has of bodies is cut to these.
-    """
-
-    tree: Tree
+    tree: Tree  # what it has of bodies is cut to these
 
     @cached_property
     def core(self) -> Core:
@@ -64,19 +60,12 @@ def place_on_body(tree: Tree, q: Floats, body: int, point: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class FrameKinematics(Frozen):
-    """A frame of a robot. Made by :func:`frame_kinematics`.
+    """A frame of a robot. Made by :func:`frame_kinematics`."""
 
-    Attributes:
-        frame: Name of the frame.
-        links: The bodies from the root to the one that carries the frame.
-        rotation: Rotation of the frame in that body (3, 3).
-        translation: Position of the frame in that body (3,) [m].
-    """
-
-    frame: str
-    links: Links
-    rotation: Floats
-    translation: Floats
+    frame: str  # its name
+    links: Links  # the bodies from the root to the one that carries it
+    rotation: Floats  # (3, 3) in that body
+    translation: Floats  # (3,) in that body [m]
 
     @cached_property
     def key(self) -> bytes:
@@ -97,7 +86,7 @@ class FrameKinematics(Frozen):
 
 def frame_kinematics(robot: Robot, frame: str) -> FrameKinematics:
     """A frame by its name; an InputError if no joint moves it."""
-    body, rotation, translation = place_of_frame(robot.free_model, frame, robot.name)
+    body, rotation, translation = place_of_frame(robot.model, frame, robot.name)
     if body < 0:
         raise InputError(f"frame {frame!r} of robot {robot.name!r} is fixed to the base: no joint moves it")
     return FrameKinematics(frame, links(robot.tree, body), rotation, translation)

@@ -6,7 +6,7 @@ import logging
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -14,11 +14,9 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError, UnknownJoint
-from varpin.model.inertia import faults
-from varpin.model.mesh_inertia import with_mesh_inertias
+from varpin.model.inertia import Payload, carry, faults, with_mesh_inertias
 from varpin.model.mimic import joint_index
-from varpin.model.payload import Payload, carry
-from varpin.model.robot import Robot, check_inertia
+from varpin.model.robot import Robot, check_inertia, limits_of
 from varpin.model.sources import describe
 from varpin.model.tree import is_unbounded, joint_axis
 from varpin.model.units import ADVICE, looks_like_degrees
@@ -104,33 +102,36 @@ def load_robot(
         InputError: A xacro file has no argument of that name, or a base or an armature is invalid.
         SingularMassMatrix: A joint moves no inertia, or a negative one.
     """
-    word("inertia", inertia, ("file", "meshes"))
-    whole = describe(source, package_dirs, mimic=mimic, xacro_args=xacro_args, srdf=srdf)
-    if inertia == "meshes":
-        whole = with_mesh_inertias(whole, density)
-    robot = assemble(whole, lock=lock, keep=keep, payload=payload, base=base, armature=armature)
+    robot = unchecked_robot(**locals())
     for note in robot.notes:
         logger.info("robot %r: %s", robot.name, note)
-    wrong = (*robot.faults, *faults(robot.free_model, robot.inertials))
+    wrong = (*robot.faults, *faults(robot.model, robot.inertials))
     for remark in (*robot.remarks, *wrong, *robot.limit_remarks()):
         logger.warning("robot %r: %s", robot.name, remark)
     check_inertia(robot)
     return robot
 
 
-def assemble(
-    robot: Robot,
+def unchecked_robot(
+    source: object,
     *,
-    lock: Mapping[str, ArrayLike] | None = None,
-    keep: Sequence[str] | None = None,
-    payload: Payload | Sequence[Payload] = (),
-    base: Base = None,
-    armature: JointValues | None = None,
+    payload: Payload | Sequence[Payload],
+    lock: Mapping[str, ArrayLike] | None,
+    keep: Sequence[str] | None,
+    base: Base,
+    armature: JointValues | None,
+    inertia: str,
+    density: float,
+    **reading: Any,
 ) -> Robot:
-    """A robot as its source describes it, with the options of :func:`load_robot`; its inertia is not checked."""
+    """The robot of :func:`load_robot`, whose arguments these are, before its inertia is checked."""
+    word("inertia", inertia, ("file", "meshes"))
+    robot = describe(source, **reading)
+    if inertia == "meshes":
+        robot = with_mesh_inertias(robot, density)
     robot = _on_base(robot, base)
-    carry(robot.free_model, (payload,) if isinstance(payload, Payload) else payload, robot.name)
-    names = list(robot.free_model.names)
+    carry(robot.model, (payload,) if isinstance(payload, Payload) else payload, robot.name)
+    names = list(robot.model.names)
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise RobotError(f"robot {robot.name!r} has several joints named {', '.join(map(repr, twice))}")
     robot = hold_joints(robot, _locks(robot, lock, keep))
@@ -145,7 +146,7 @@ def _on_base(robot: Robot, base: Base) -> Robot:
         return robot.rebuilt(place=transform(base, "base", ", or 'planar'"))
     if base != "planar":
         raise InputError(f"base must be 'planar', a transform (4, 4) or a pin.SE3, got {base!r}")
-    if taken := sorted(set(PLANAR) & set(robot.free_model.names)):
+    if taken := sorted(set(PLANAR) & set(robot.model.names)):
         raise InputError(f"base='planar' adds the joints {', '.join(PLANAR)}, but the robot already has {taken[0]!r}")
     kinds = pin.JointModelPX(), pin.JointModelPY(), pin.JointModelRZ()
     return robot.rebuilt(root=tuple(zip(PLANAR, kinds, strict=True)))
@@ -166,7 +167,7 @@ def transform(base: ArrayLike | pin.SE3, what: str, otherwise: str = "") -> pin.
 
 def _with_rotors(robot: Robot, armature: JointValues) -> Robot:
     """The robot with another armature of its coordinates, a number, (n,) or by joint name; locked joints have none."""
-    model, names = robot.free_model, robot.joint_names
+    model, names = robot.model, robot.joint_names
     indices = [model.joints[model.getJointId(name)].idx_v for name in names]
     armatures = np.array(model.armature)[indices]
     if not isinstance(armature, Mapping):
@@ -182,7 +183,7 @@ def _with_rotors(robot: Robot, armature: JointValues) -> Robot:
     values = np.array(model.armature)
     values[indices] = armatures
     model.armature = values
-    return robot.changed(free_model=model)
+    return robot.changed(model=model)
 
 
 def _locks(robot: Robot, lock: Mapping[str, ArrayLike] | None, keep: Sequence[str] | None) -> Mapping[str, ArrayLike]:
@@ -194,7 +195,7 @@ def _locks(robot: Robot, lock: Mapping[str, ArrayLike] | None, keep: Sequence[st
         return given
     if isinstance(keep, str | Mapping) or not isinstance(keep, Iterable):
         raise InputError(f"keep must be a list of joint names, got {keep!r}")
-    keep, model = tuple(keep), robot.free_model
+    keep, model = tuple(keep), robot.model
     leaders = {model.names[tie.follower]: model.names[tie.leader] for tie in robot.ties}
     for name in keep:
         if name not in joint_index(model):
@@ -209,13 +210,10 @@ def _locks(robot: Robot, lock: Mapping[str, ArrayLike] | None, keep: Sequence[st
         if joint == 0 or name in (*keep, *PLANAR) or name in leaders or name in given:
             continue
         kind = model.joints[joint]
-        at = slice(kind.idx_q, kind.idx_q + kind.nq)
         if kind.nv > 1:
-            given[name] = neutral[at]
-        elif kind.nq == 2:
-            given[name] = 0.0
+            given[name] = neutral[kind.idx_q : kind.idx_q + kind.nq]
         else:
-            low, high = float(model.lowerPositionLimit[at][0]), float(model.upperPositionLimit[at][0])
+            low, high, *_ = limits_of(model, joint)
             given[name] = min(max(0.0, low), high) if low < high else 0.0
     return given
 
@@ -223,11 +221,9 @@ def _locks(robot: Robot, lock: Mapping[str, ArrayLike] | None, keep: Sequence[st
 def hold_joints(robot: Robot, lock: Mapping[str, ArrayLike]) -> Robot:
     """A robot that is no combined one, with joints locked at positions by name [rad or m].
 
-    Followers of locked leaders are locked as well. Continuous joints among leaders and followers become revolute joints
-    without limits: a (cos, sin) pair loses whole turns, which matter to a gear, and Pinocchio cannot tie such a joint
-    to one of another kind.
+    Followers of locked leaders are locked as well.
     """
-    model, index = robot.free_model, joint_index(robot.free_model)
+    model, index = robot.model, joint_index(robot.model)
     leaders = {tie.follower: tie for tie in robot.ties}
     positions: dict[int, Floats] = {}
     for name, value in lock.items():
@@ -242,10 +238,8 @@ def hold_joints(robot: Robot, lock: Mapping[str, ArrayLike]) -> Robot:
         if tie.leader in positions:
             positions[tie.follower] = tie.ratio * positions[tie.leader] + tie.offset
     held = {joint: _motion(model, joint, position) for joint, position in positions.items()}
-    geared = {joint for tie in robot.ties for joint in (tie.leader, tie.follower) if is_unbounded(model, joint)}
-    kinds = {joint: pin.JointModelRevoluteUnaligned(joint_axis(model, joint)[1]) for joint in geared - set(held)}
-    if held or kinds:
-        robot = robot.rebuilt(held=held, kinds=kinds)
+    if held:
+        robot = robot.rebuilt(held=held)
     now = {model.names[joint]: float(at[0]) if at.size == 1 else tuple(at.tolist()) for joint, at in positions.items()}
     loops = tuple((a, b) for a, b in robot.loops if _carriers(robot, a).isdisjoint(_carriers(robot, b)))
     robot = robot.changed(locked=MappingProxyType({**robot.locked, **now}), loops=loops)
@@ -269,7 +263,7 @@ def _motion(model: pin.Model, joint: int, position: Floats) -> pin.SE3:
 
 def _carriers(robot: Robot, name: str) -> set[int]:
     """The joints that carry the frames of a name; a loop on one joint alone is closed for good."""
-    frames = robot.free_model.frames
+    frames = robot.model.frames
     return {frame.parentJoint for frame in frames if frame.name == name and frame.type != pin.FrameType.JOINT}
 
 
@@ -280,8 +274,8 @@ def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
     if position.shape != (size,):
         raise InputError(f"{name} must have {size} value(s), got shape {position.shape}")
     require_finite(name, position)
-    if kind.nv == 1 and kind.nq == 1:
-        low, high = (float(limits[kind.idx_q]) for limits in (model.lowerPositionLimit, model.upperPositionLimit))
+    if kind.nv == 1:
+        low, high, *_ = limits_of(model, joint)
         if low < high and not low - _OUTSIDE <= position[0] <= high + _OUTSIDE:
             units = not joint_axis(model, joint)[0] and looks_like_degrees(position[0])
             hint = f", and looks like degrees: {ADVICE}" if units else ""

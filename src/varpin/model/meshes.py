@@ -45,27 +45,16 @@ _BESIDE = frozenset(
 
 @dataclass(frozen=True, eq=False)
 class MeshPart:
-    """The triangles of a mesh that share a material.
+    """The triangles of a mesh that share a material; colours are from 0 to 1."""
 
-    Attributes:
-        vertices: Corners (V, 3) [m].
-        faces: Indices of the corners of each triangle (F, 3), anticlockwise from outside.
-        normals: Unit normals at the corners (V, 3); None if the file has none.
-        uv: Texture coordinates (V, 2), or None.
-        colors: Red, green and blue at the corners (V, 3) from 0 to 1, or None.
-        color: Red, green, blue and opacity (4,) of the material from 0 to 1; None if there is no material.
-        shine: Properties of the material besides its colour by three.js's names, colours as (3,) from 0 to 1.
-        texture: An image file, or None.
-    """
-
-    vertices: Floats
-    faces: NDArray[np.int64]
-    normals: Floats | None = None
-    uv: Floats | None = None
-    colors: Floats | None = None
-    color: Floats | None = None
-    shine: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
-    texture: Path | None = None
+    vertices: Floats  # corners (V, 3) [m]
+    faces: NDArray[np.int64]  # indices of the corners of each triangle (F, 3), anticlockwise from outside
+    normals: Floats | None = None  # unit normals at the corners (V, 3)
+    uv: Floats | None = None  # texture coordinates (V, 2)
+    colors: Floats | None = None  # red, green and blue at the corners (V, 3)
+    color: Floats | None = None  # red, green, blue and opacity (4,) of the material
+    shine: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)  # more of it, by three.js's names
+    texture: Path | None = None  # an image file
 
     def moved(self, matrix: Floats) -> MeshPart:
         """The part under a linear map and a translation (4, 4); a mirror image keeps its outside."""

@@ -1,8 +1,4 @@
-"""Mimic joints: leaders and followers, and Pinocchio models with and without the ties between them.
-
-Pinocchio computes no RNEA derivatives of a model with mimic joints. varpin therefore keeps two models: one in which
-followers are tied to their leaders, and a free one in which every joint is independent.
-"""
+"""Mimic joints, leaders and followers, which are independent in Pinocchio's model; and models rebuilt."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -75,54 +71,15 @@ def _to_free_leader(tie: Tie, ties: dict[int, Tie], model: pin.Model) -> Tie:
     raise RobotError(f"joint {model.names[tie.follower]!r} mimics itself through a loop of mimic joints")
 
 
-def tied_model(model: pin.Model, ties: Sequence[Tie]) -> pin.Model:
-    """``model`` with its followers as Pinocchio mimic joints."""
-    for tie in ties:
-        model = pin.transformJointIntoMimic(model, tie.leader, tie.follower, tie.ratio, tie.offset)
-    return model
-
-
-def depth_first(model: pin.Model, ties: Sequence[Tie]) -> list[int]:
-    """An order of the joints that Pinocchio's algorithms accept: subtrees contiguous, leaders before followers.
-
-    The given order is kept where it qualifies.
-    """
-    parents = list(model.parents)
-
-    def ancestors(joint: int) -> list[int]:
-        path = [joint]
-        while path[-1] > 0:
-            path.append(parents[path[-1]])
-        return path
-
-    before: dict[int, set[int]] = {}
-    for tie in ties:
-        leaders, followers = ancestors(tie.leader), ancestors(tie.follower)
-        if tie.follower in leaders:
-            raise RobotError(
-                f"joint {model.names[tie.follower]!r} carries the joint it mimics, {model.names[tie.leader]!r}: "
-                "Pinocchio cannot tie them; load with mimic='free' and lock one of them"
-            )
-        if tie.leader in followers:
-            continue
-        fork = next(joint for joint in leaders if joint in followers)
-        first, then = leaders[leaders.index(fork) - 1], followers[followers.index(fork) - 1]
-        before.setdefault(then, set()).add(first)
-
-    children: list[list[int]] = [[] for _ in parents]
-    for joint in range(1, model.njoints):
-        children[parents[joint]].append(joint)
+def depth_first(model: pin.Model) -> list[int]:
+    """The joints, subtree by subtree, as Pinocchio's algorithms need them."""
+    children: list[list[int]] = [[] for _ in model.parents]
+    for joint in range(model.njoints - 1, 0, -1):
+        children[model.parents[joint]].append(joint)
     order, stack = [], [0]
     while stack:
         order.append(joint := stack.pop())
-        waiting, visits = children[joint], []
-        while waiting:
-            ready = [child for child in waiting if not before.get(child, set()) & set(waiting)]
-            if not ready:
-                raise RobotError(f"mimic joints below {model.names[joint]!r} follow each other across branches")
-            waiting.remove(ready[0])
-            visits.append(ready[0])
-        stack.extend(reversed(visits))
+        stack += children[joint]
     return order[1:]
 
 
@@ -158,21 +115,13 @@ def joint_frames(model: pin.Model) -> dict[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class Rebuilt:
-    """A model rebuilt from another one, by :func:`rebuild`.
-
-    Attributes:
-        model: The new model.
-        joints: The joint of the new model that carries the bodies of each old joint.
-        places: The placement of each old joint in that one.
-        frames: The index in the new model of each old frame.
-        held: The old joints that are no joints of the new one.
-    """
+    """A model rebuilt from another one, by :func:`rebuild`."""
 
     model: pin.Model
-    joints: Mapping[int, int]
-    places: Mapping[int, pin.SE3]
-    frames: Mapping[int, int]
-    held: Collection[int]
+    joints: Mapping[int, int]  # the joint of the new model that carries the bodies of each old joint
+    places: Mapping[int, pin.SE3]  # of each old joint in that one
+    frames: Mapping[int, int]  # the index in the new model of each old frame
+    held: Collection[int]  # the old joints that are no joints of the new one
 
     def ties(self, ties: Sequence[Tie]) -> tuple[Tie, ...]:
         """Those of the ties whose joints are still there."""
@@ -197,28 +146,15 @@ class Rebuilt:
 def rebuild(
     model: pin.Model,
     *,
-    order: Sequence[int] = (),
-    kinds: Mapping[int, pin.JointModel] | None = None,
-    held: Mapping[int, pin.SE3] | None = None,
-    root: Sequence[tuple[str, pin.JointModel]] = (),
-    place: pin.SE3 | None = None,
-    onto: pin.Model | None = None,
-    prefix: str = "",
+    order: Sequence[int] = (),  # of its joints, without the universe; as they are if left out
+    kinds: Mapping[int, pin.JointModel] | None = None,  # joints of another kind
+    held: Mapping[int, pin.SE3] | None = None,  # joints to fix, and their motion there
+    root: Sequence[tuple[str, pin.JointModel]] = (),  # joints in series between the universe and the root joints
+    place: pin.SE3 | None = None,  # of the model's universe; the identity if left out
+    onto: pin.Model | None = None,  # a model to append to, after its joints; a new one if left out
+    prefix: str = "",  # of the names of joints and frames
 ) -> Rebuilt:
-    """Rebuild a model with other joints, or elsewhere. Links, frames, limits and armature are kept.
-
-    Every joint of the new model has a frame.
-
-    Args:
-        model: The model.
-        order: Its joints in their new order, without the universe; as they are if left out.
-        kinds: Joints of another kind.
-        held: Joints to fix, and their motion there.
-        root: Names and kinds of joints to insert in series between the universe and the model's root joints.
-        place: Placement of the model's universe; the identity if left out.
-        onto: A model to append to, after its joints; a new one if left out.
-        prefix: Prefix of the names of joints and frames.
-    """
+    """Rebuild a model with other joints, or elsewhere. Links, frames, limits and armature are kept."""
     kinds, held, new = kinds or {}, held or {}, onto
     if new is None:
         new = pin.Model()
@@ -257,14 +193,7 @@ def rebuild(
         placement = places[joint] * frame.placement
         copied = pin.Frame(prefix + frame.name, joints[joint], up, placement, kind, pin.Inertia.Zero())
         frames[index] = new.addFrame(copied, False)
-    _repair_velocity_limits(new)
+    # Pinocchio's addJoint sets lower velocity limits to the largest double with the wrong sign.
+    lower, upper = np.array(new.lowerVelocityLimit), np.array(new.upperVelocityLimit)
+    new.lowerVelocityLimit = np.where(lower > upper, -upper, lower)
     return Rebuilt(new, joints, places, frames, held)
-
-
-def _repair_velocity_limits(model: pin.Model) -> None:
-    """Replace a lower velocity limit above the upper one by -upper.
-
-    Pinocchio's addJoint sets the lower limit to the largest double with the wrong sign.
-    """
-    lower, upper = np.array(model.lowerVelocityLimit), np.array(model.upperVelocityLimit)
-    model.lowerVelocityLimit = np.where(lower > upper, -upper, lower)

@@ -23,38 +23,23 @@ _FIND = re.compile(r"\$\(find ([^)]+)\)/?")
 
 @dataclass(frozen=True)
 class Files:
-    """The files of a robot, and what they are read with.
+    """The files of a robot, and what they are read with."""
 
-    Attributes:
-        name: The robot's name.
-        path: The URDF, xacro or MJCF file.
-        folders: Folders in which packages are looked up.
-        xacro_args: Arguments of a xacro file.
-        packages: Folders of packages by name.
-        srdf: The SRDF file or its xacro file; None for the one beside the robot's file.
-        srdf_args: Arguments of that xacro file.
-    """
-
-    name: str
-    path: Path
-    folders: tuple[str, ...] = ()
+    name: str  # of the robot
+    path: Path  # a URDF, xacro or MJCF file
+    folders: tuple[str, ...] = ()  # in which packages are looked up
     xacro_args: Mapping[str, object] = field(default_factory=dict)
-    packages: Mapping[str, str] = field(default_factory=dict)
-    srdf: Path | None = None
-    srdf_args: Mapping[str, object] = field(default_factory=dict)
+    packages: Mapping[str, str] = field(default_factory=dict)  # folders of packages by name
+    srdf: Path | None = None  # the SRDF file or its xacro file; None for the one beside the robot's file
+    srdf_args: Mapping[str, object] = field(default_factory=dict)  # of that xacro file
 
 
 @dataclass(frozen=True, eq=False)
 class Packages(Frozen):
-    """Where packages and files that a robot's file names are looked up.
+    """Where packages and files that a robot's file names are looked up."""
 
-    Attributes:
-        file: The robot's file.
-        folders: Folders that contain packages, or are packages.
-    """
-
-    file: Path
-    folders: tuple[str, ...] = ()
+    file: Path  # the robot's file
+    folders: tuple[str, ...] = ()  # that contain packages, or are packages
 
     @cached_property
     def places(self) -> tuple[Path, ...]:

@@ -20,7 +20,7 @@ from varpin.model.equalities import Equality
 from varpin.model.inertia import faults
 from varpin.model.kinematics import place_on_body
 from varpin.model.meshes import Reader, read_mesh, with_own_meshes
-from varpin.model.mimic import Tie, rebuild, tied_model
+from varpin.model.mimic import Tie, rebuild
 from varpin.model.mjcf import mjcf_shapes
 from varpin.model.srdf import Posture
 from varpin.model.tree import flatten, mechanism, place_of_frame, to_pinocchio
@@ -51,8 +51,9 @@ class Robot(Frozen):
 
     Attributes:
         name: Name of the file, the bundled robot or the model.
-        free_model: The model with mimic joints independent, on which Pinocchio computes every derivative.
-        ties: The mimic joints, by index in ``free_model``.
+        model: The Pinocchio model, in which mimic joints are independent: :meth:`configuration` and :meth:`velocity`
+            move them as their leaders do.
+        ties: The mimic joints, by index in ``model``.
         locked: Locked joints and their positions [rad or m].
         urdf: The URDF or xacro file the robot was read from, or None.
         expanded: The URDF text of a xacro file.
@@ -71,7 +72,7 @@ class Robot(Frozen):
     """
 
     name: str
-    free_model: pin.Model = field(repr=False)
+    model: pin.Model = field(repr=False)
     ties: tuple[Tie, ...] = field(repr=False)
     locked: Mapping[str, float | tuple[float, ...]] = field(default_factory=lambda: MappingProxyType({}))
     urdf: Path | None = None
@@ -96,7 +97,7 @@ class Robot(Frozen):
     def _repr_html_(self) -> str:
         lower, upper = self.position_limits
         columns = zip(self.joint_names, lower, upper, self.velocity_limit, self.effort_limit, strict=True)
-        tied = (self.free_model.names[tie.follower] for tie in self.ties)
+        tied = (self.model.names[tie.follower] for tie in self.ties)
         loops = (f"{a} on {b}" for a, b in self.loops)
         rows: list[tuple[str, object]] = [
             ("joints that move", self.dof),
@@ -113,27 +114,24 @@ class Robot(Frozen):
 
     def rebuilt(self, **changes: Any) -> Robot:
         """The robot with its model rebuilt; see :func:`varpin.model.mimic.rebuild`."""
-        new = rebuild(self.free_model, **changes)
-        return self.changed(free_model=new.model, ties=new.ties(self.ties), visuals=new.shapes(self.visuals))
+        new = rebuild(self.model, **changes)
+        return self.changed(model=new.model, ties=new.ties(self.ties), visuals=new.shapes(self.visuals))
 
-    @cached_property
-    def model(self) -> pin.Model:
-        """The Pinocchio model with mimic joints tied to their leaders; ``model.nv == dof``.
-
-        A continuous joint takes two entries of Pinocchio's configuration: see :meth:`configuration`.
-        """
-        return tied_model(self.free_model, self.ties)
+    @property
+    def free_model(self) -> pin.Model:
+        """:attr:`model`: in both, mimic joints are free."""
+        return self.model
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the joints that are coordinates, in order."""
-        return tuple(self.free_model.names[joint] for joint in self._coordinates)
+        return tuple(self.model.names[joint] for joint in self._coordinates)
 
     @property
     def _coordinates(self) -> tuple[int, ...]:
-        """Indices in ``free_model`` of the joints that are coordinates."""
+        """Indices in ``model`` of the joints that are coordinates."""
         followers = {tie.follower for tie in self.ties}
-        return tuple(joint for joint in range(1, self.free_model.njoints) if joint not in followers)
+        return tuple(joint for joint in range(1, self.model.njoints) if joint not in followers)
 
     @cached_property
     def tree(self) -> Tree:
@@ -142,7 +140,7 @@ class Robot(Frozen):
         Raises:
             UnsupportedJoint: A joint has no single axis.
         """
-        return flatten(self.free_model, self.ties, self._coordinates)
+        return flatten(self.model, self.ties, self._coordinates)
 
     @cached_property
     def dof(self) -> int:
@@ -205,25 +203,18 @@ class Robot(Frozen):
         q = as_floats("q", q)
         if q.shape[-1:] != (self.dof,):
             raise InputError(f"q must have shape (..., {self.dof}), got {q.shape}")
-        order = [self.joint_names.index(name) for name in self.model.names if name in self.joint_names]
-        return to_pinocchio(self.model, q[..., order])
+        return to_pinocchio(self.model, q[..., self.tree.coordinate] * self.tree.ratio + self.tree.offset)
 
-    def free_positions(self, q: ArrayLike) -> Floats:
-        """``q`` (..., n) as configurations (..., free_model.nq) of ``free_model``."""
-        q = np.asarray(q, dtype=float)
-        positions = q[..., self.tree.coordinate] * self.tree.ratio + self.tree.offset
-        return to_pinocchio(self.free_model, positions)
-
-    def free_velocities(self, v: ArrayLike) -> Floats:
-        """``v`` (..., n) as velocities (..., free_model.nv) of ``free_model``: linear in v."""
+    def velocity(self, v: ArrayLike) -> Floats:
+        """``v`` (..., n) as velocities (..., model.nv) of ``model``: linear in v."""
         return np.asarray(v, dtype=float)[..., self.tree.coordinate] * self.tree.ratio
 
     @property
     def end_effector(self) -> str:
         """Name of the last frame on the joint with the most ancestors, or on the last of several such joints."""
-        depths = [len(path) for path in self.free_model.supports]
-        last = max(range(self.free_model.njoints), key=lambda j: (depths[j], j))
-        return str([frame.name for frame in self.free_model.frames if frame.parentJoint == last][-1])
+        depths = [len(path) for path in self.model.supports]
+        last = max(range(self.model.njoints), key=lambda j: (depths[j], j))
+        return str([frame.name for frame in self.model.frames if frame.parentJoint == last][-1])
 
     def frame_positions(self, q: ArrayLike, frame: str | None = None) -> Floats:
         """World positions [m] of a frame, or of :attr:`end_effector`: (N, 3) for ``q`` (N, n), (3,) for ``q`` (n,).
@@ -235,7 +226,7 @@ class Robot(Frozen):
         if q.ndim not in (1, 2) or q.shape[-1] != self.dof:
             raise InputError(f"q must have shape (N, {self.dof}) or ({self.dof},), got {q.shape}")
         name = self.end_effector if frame is None else frame
-        body, _, place = place_of_frame(self.free_model, name, self.name)
+        body, _, place = place_of_frame(self.model, name, self.name)
         positions = place_on_body(self.tree, np.atleast_2d(q), body, place)
         return np.asarray(positions.reshape(*q.shape[:-1], 3), dtype=np.float64)
 
@@ -245,61 +236,60 @@ class Robot(Frozen):
         lower, upper = self.position_limits
         return ~self.slides & np.isinf(lower) & np.isinf(upper)
 
-    @cached_property
+    @property
     def position_limits(self) -> tuple[Floats, Floats]:
         """Lower and upper bounds (n,), (n,) [rad or m]; infinite where there are none.
 
         Two bounds of 0 count as none, since a URDF without limits is read so; to hold a joint still, lock it. A leader
         keeps within the limits of the mimic joints that follow it, unless they leave it no room.
         """
-        return self._position_limits[:2]
+        lower, upper, _, _ = self._limits[0]
+        return lower, upper
 
-    @cached_property
-    def _position_limits(self) -> tuple[Floats, Floats, tuple[str, ...]]:
-        """:attr:`position_limits`, and the followers whose limits would leave their leader no room."""
-        lower, upper = np.full(self.dof, -np.inf), np.full(self.dof, np.inf)
-        tree, model, left_out = self.tree, self.free_model, []
-        followers = {tie.follower for tie in self.ties}
-        for body in range(model.njoints - 1):
-            low, high = limits_of(model, body + 1)[:2]
-            c, ratio = int(tree.coordinate[body]), float(tree.ratio[body])
-            if body + 1 in followers:
-                if ratio == 0.0:
-                    continue
-                low, high = (
-                    (limit - tree.offset[body]) / ratio for limit in ((low, high) if ratio > 0.0 else (high, low))
-                )
-                low, high = max(low, lower[c]), min(high, upper[c])
-                if not low < high:
-                    left_out.append(model.names[body + 1])
-                    continue
-            lower[c], upper[c] = low, high
-        for limit in (lower, upper):
-            limit.setflags(write=False)
-        return lower, upper, tuple(left_out)
-
-    @cached_property
+    @property
     def velocity_limit(self) -> Floats:
         """Bound (n,) [rad/s or m/s]; infinite where there is none, or one of 0.
 
         The bound of a mimic joint is one of its leader.
         """
-        return self._limit(2, -1)
+        return self._limits[0][2]
 
-    @cached_property
+    @property
     def effort_limit(self) -> Floats:
         """Bound (n,) [N m or N]; infinite where there is none, or one of 0.
 
         The bound of a mimic joint is one of its leader: what the leader exerts, the follower has to bear.
         """
-        return self._limit(3, 1)
+        return self._limits[0][3]
+
+    @cached_property
+    def _limits(self) -> tuple[tuple[Floats, Floats, Floats, Floats], tuple[str, ...]]:
+        """All limits of the coordinates, and the followers whose limits would leave their leader no room."""
+        lower, velocity, left_out = np.full(self.dof, -np.inf), np.full(self.dof, np.inf), []
+        upper, effort, tree = velocity.copy(), velocity.copy(), self.tree
+        for joint in (*self._coordinates, *(tie.follower for tie in self.ties)):
+            c, ratio, offset = (values[joint - 1] for values in (tree.coordinate, tree.ratio, tree.offset))
+            if ratio == 0.0:
+                continue
+            low, high, speed, force = limits_of(self.model, joint)
+            velocity[c], effort[c] = min(velocity[c], speed / abs(ratio)), min(effort[c], force * abs(ratio))
+            low, high = ((limit - offset) / ratio for limit in ((low, high) if ratio > 0.0 else (high, low)))
+            low, high = max(low, lower[c]), min(high, upper[c])
+            if joint in self._coordinates or low < high:
+                lower[c], upper[c] = low, high
+            else:
+                left_out.append(self.model.names[joint])
+        limits = lower, upper, velocity, effort
+        for limit in limits:
+            limit.setflags(write=False)
+        return limits, tuple(left_out)
 
     def limit_remarks(self) -> Iterator[str]:
         """What is odd about limits, one sentence a kind."""
         bounds = zip(self.joint_names, *self.position_limits, strict=True)
         if tight := [f"{low:g} and {high:g} of {name!r}" for name, low, high in bounds if not low < high]:
             yield f"limits leave no room to move (lock= holds a joint): {listed(tight, 'joints')}"
-        if names := self._position_limits[2]:
+        if names := self._limits[1]:
             joints = listed(map(repr, names), "mimic joints")
             yield f"limits that leave the joint that a mimic joint follows no room are left out: those of {joints}"
 
@@ -309,7 +299,7 @@ class Robot(Frozen):
 
         The damping of a mimic joint is added to that of its leader.
         """
-        return self._at_coordinates(self.free_model.damping, self.tree.ratio**2)
+        return self._at_coordinates(self.model.damping, self.tree.ratio**2)
 
     @cached_property
     def slides(self) -> NDArray[np.bool_]:
@@ -332,21 +322,12 @@ class Robot(Frozen):
     @property
     def friction(self) -> Floats:
         """Dry friction in the description (n,) [N m or N]; ``Scene(friction="robot")`` uses it."""
-        return self._at_coordinates(self.free_model.friction, np.abs(self.tree.ratio))
+        return self._at_coordinates(self.model.friction, np.abs(self.tree.ratio))
 
     def _at_coordinates(self, values: ArrayLike, weights: Floats) -> Floats:
-        """Weighted sums (n,) over the joints of ``free_model`` that each coordinate moves."""
+        """Weighted sums (n,) over the joints of ``model`` that each coordinate moves."""
         sums = np.bincount(self.tree.coordinate, np.asarray(values, dtype=float) * weights, minlength=self.dof)
         return np.asarray(sums, dtype=np.float64)
-
-    def _limit(self, which: int, power: int) -> Floats:
-        """The least limit (n,) of the joints that each coordinate moves, times their ratios to a power."""
-        limit = np.full(self.dof, np.inf)
-        for body, (c, ratio) in enumerate(zip(self.tree.coordinate, np.abs(self.tree.ratio), strict=True)):
-            if ratio > 0.0:
-                limit[c] = min(limit[c], limits_of(self.free_model, body + 1)[which] * ratio**power)
-        limit.setflags(write=False)
-        return limit
 
 
 def limits_of(model: pin.Model, joint: int) -> tuple[float, float, float, float]:
@@ -386,16 +367,16 @@ def readable_geometry(robot: Robot, read: Reader = read_mesh) -> tuple[pin.Geome
     """The readable part of :func:`geometry`, link by link.
 
     Returns:
-        The shapes of the links that can be read, and for each other link by name, its joint in ``free_model`` and its
+        The shapes of the links that can be read, and for each other link by name, its joint in ``model`` and its
         fault in words; missing meshes share one message.
     """
-    joints = {frame.name: frame.parentJoint for frame in robot.free_model.frames if frame.type == pin.FrameType.BODY}
+    joints = {frame.name: frame.parentJoint for frame in robot.model.frames if frame.type == pin.FrameType.BODY}
     together = pin.GeometryModel()
     faulty: dict[str, tuple[int, str]] = {}
     for part, prefix, _ in robot.parts:
         shapes, what = readable_geometry(part, read)
         faulty |= {prefix + name: (joints[prefix + name], fault) for name, (_, fault) in what.items()}
-        _hang(robot, part.free_model, shapes, prefix)
+        _hang(robot, part.model, shapes, prefix)
         for shape in shapes.geometryObjects:
             shape.name = prefix + shape.name
             together.addGeometryObject(shape)
@@ -418,7 +399,7 @@ def readable_geometry(robot: Robot, read: Reader = read_mesh) -> tuple[pin.Geome
 
 def _hang(robot: Robot, full: pin.Model, shapes: pin.GeometryModel, prefix: str = "") -> pin.GeometryModel:
     """Hang shapes of another model, such as that of the file before joints were locked, on the frames of a robot."""
-    model = robot.free_model
+    model = robot.model
     for shape in shapes.geometryObjects:
         link = full.frames[shape.parentFrame]
         shape.parentFrame = model.getFrameId(prefix + link.name, link.type) if shape.parentFrame else 0
@@ -453,7 +434,7 @@ def check_inertia(robot: Robot) -> None:
             worst, negative = np.abs(vectors[:, 0]), bool(values[0] < -rounding)
             faulty = worst >= 0.5 * worst.max()
         # Beside a link of a billion kg every other inertia is a rounding error.
-        heavy = next((text for text in faults(robot.free_model, ()) if " has a mass of " in text), "")
+        heavy = next((text for text in faults(robot.model, ()) if " has a mass of " in text), "")
         raise SingularMassMatrix(
             np.array(robot.joint_names)[faulty].tolist(), negative=negative, cause=heavy, hint="".join(robot.faults[:1])
         )

@@ -54,11 +54,11 @@ def robot_names() -> tuple[str, ...]:
 
 def describe(
     source: object,
-    package_dirs: Sequence[str | os.PathLike[str]] | None = None,
     *,
-    mimic: Literal["tied", "free"] = "tied",
-    xacro_args: Mapping[str, object] | None = None,
-    srdf: str | os.PathLike[str] | None = None,
+    package_dirs: Sequence[str | os.PathLike[str]] | None,
+    mimic: Literal["tied", "free"],
+    xacro_args: Mapping[str, object] | None,
+    srdf: str | os.PathLike[str] | None,
 ) -> Robot:
     """Find and parse ``source``; see :func:`varpin.load_robot`.
 
@@ -76,10 +76,14 @@ def describe(
         srdf=path or files.srdf,
         srdf_args={**(files.srdf_args if path is None else {}), **arguments},
     )
-    if isinstance(source, pin.Model):
-        robot = _of_model(source, source.name or "model", None)
-    elif isinstance(source, pin.RobotWrapper):
-        robot = _of_model(source.model, source.model.name or "robot", source.visual_model)
+    if isinstance(source, pin.Model | pin.RobotWrapper):
+        model, shapes = (source, None) if isinstance(source, pin.Model) else (source.model, source.visual_model)
+        try:
+            robot = _of_model(model, model.name or "model", shapes)
+        except RobotError:
+            raise
+        except (IndexError, ValueError, RuntimeError) as error:
+            raise RobotError(f"model {model.name!r} is damaged: {error}") from None
     elif files.name:
         robot = _of_files(files, tied=mimic == "tied")
     else:
@@ -129,7 +133,7 @@ def _folders(package_dirs: Sequence[str | os.PathLike[str]] | str | os.PathLike[
     if isinstance(package_dirs, str | os.PathLike):
         package_dirs = [package_dirs]
     try:
-        return tuple(str(Path(folder).expanduser()) for folder in package_dirs or ())
+        return tuple(str(Path(folder).expanduser()) for folder in (() if package_dirs is None else package_dirs))
     except (TypeError, RuntimeError):
         raise InputError(f"package_dirs must be a list of folders, got {package_dirs!r}") from None
 
@@ -140,7 +144,7 @@ def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) ->
     shapes = visuals.copy() if visuals is not None else None
     ties, kinds = of_mimics(model)
     robot = Robot(name, model.copy(), ties, visuals=shapes, group_states=reference_postures(model))
-    order = depth_first(model, ties)
+    order = depth_first(model)
     if kinds or order != sorted(order) or len(joint_frames(model)) < model.njoints - 1:
         robot = robot.rebuilt(order=order, kinds=kinds)
     if order != sorted(order):
@@ -148,14 +152,14 @@ def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) ->
         logger.warning(
             "the joints of model %r were not added subtree by subtree, as Pinocchio's algorithms need: reordered to %s",
             name,
-            ", ".join(list(robot.free_model.names)[1:]),
+            ", ".join(list(robot.model.names)[1:]),
         )
-    frames = robot.free_model.frames
+    frames = robot.model.frames
     for shape in shapes.geometryObjects if (shapes := robot.visuals) is not None else ():
         # Where a shape has no frame of its joint, it has the joint's.
         if shape.parentFrame >= len(frames) or frames[shape.parentFrame].parentJoint != shape.parentJoint:
-            joint = robot.free_model.names[shape.parentJoint]
-            shape.parentFrame = robot.free_model.getFrameId(joint, pin.FrameType.JOINT) if shape.parentJoint else 0
+            joint = robot.model.names[shape.parentJoint]
+            shape.parentFrame = robot.model.getFrameId(joint, pin.FrameType.JOINT) if shape.parentJoint else 0
     return robot
 
 
@@ -178,7 +182,7 @@ def _of_files(files: Files, *, tied: bool) -> Robot:
         return robot.changed(mjcf=path, remarks=remarks, loops=loops, equalities=equalities)
     urdf = read_urdf(path, text)
     ties, alone = ties_of(urdf.mimics, urdf.model) if tied else ((), ())
-    robot = Robot(
+    return Robot(
         files.name,
         urdf.model,
         ties,
@@ -191,8 +195,6 @@ def _of_files(files: Files, *, tied: bool) -> Robot:
         notes=urdf.notes,
         faults=urdf.faults,
     )
-    order = depth_first(urdf.model, ties)
-    return robot if order == sorted(order) else robot.rebuilt(order=order)
 
 
 def _places(path: Path, folders: tuple[str, ...]) -> tuple[str, ...]:
@@ -203,7 +205,7 @@ def _places(path: Path, folders: tuple[str, ...]) -> tuple[str, ...]:
 
 def _with_srdf(robot: Robot, files: Files) -> Robot:
     """The postures and rotors of the SRDF file that was asked for, or of the one beside the robot's file."""
-    path, model = files.srdf, robot.free_model
+    path, model = files.srdf, robot.model
     if path is None and robot.urdf is not None:
         path = beside(robot.urdf, model.name)
     states = robot.group_states

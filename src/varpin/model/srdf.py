@@ -14,24 +14,15 @@ from varpin.model.xacro import plain_name
 
 @dataclass(frozen=True)
 class Posture:
-    """Named positions of joints.
-
-    Attributes:
-        name: Name of the posture.
-        group: Name of the group of joints; empty if there is none.
-        positions: Joints and their positions [rad or m].
-    """
+    """Named positions of joints."""
 
     name: str
-    group: str
-    positions: tuple[tuple[str, float], ...]
+    group: str  # of joints; empty if there is none
+    positions: tuple[tuple[str, float], ...]  # by joint [rad or m]
 
 
 def beside(path: Path, robot: str) -> Path | None:
-    """The SRDF file of a robot in the folder of its file ``path``, or in a sibling folder ``srdf``.
-
-    It is the one with the name of the robot's file, or else the only one whose robot is named ``robot``.
-    """
+    """The SRDF file beside a robot's file, or in a sibling folder: of its name, or the only one of the robot's."""
     found = sorted([*path.parent.glob("*.srdf"), *path.parent.parent.glob("srdf/*.srdf")])
     for file in found:
         if file.stem == plain_name(path):
@@ -41,14 +32,8 @@ def beside(path: Path, robot: str) -> Path | None:
 
 
 def read_srdf(path: Path, text: str | None = None) -> tuple[tuple[Posture, ...], dict[str, float]]:
-    """Read an SRDF file.
-
-    Returns:
-        Its postures, and the armature of joints by name [kg m^2 or kg]: rotor inertia times squared gear ratio.
-    """
-    root = read_xml(path, text)
-    if root.tag != "robot":
-        raise RobotError(f"{path} is not an SRDF: its root element is <{root.tag}>, not <robot>")
+    """The postures of an SRDF file, and the armature of joints by name [kg m^2 or kg]."""
+    root = read_xml(path, text, "SRDF")
     postures, armature = [], {}
     for state in root.findall("group_state"):
         name, positions = state.get("name", ""), []

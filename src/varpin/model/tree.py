@@ -90,11 +90,16 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
     bodies: dict[str, Any] = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     parent, coordinate, prismatic = bodies["parent"], bodies["coordinate"], bodies["prismatic"]
     group = independent_groups(parent, coordinate, len(coordinates))
+    # That of followers counts at their leaders, times the squares of their ratios.
+    armature: Floats = np.zeros(len(coordinates))
+    np.add.at(armature, coordinate, np.asarray(model.armature) * bodies["ratio"] ** 2)
+    if not (np.isfinite(armature).all() and (armature >= 0.0).all()):
+        raise RobotError(f"armature must be finite and >= 0, got {armature}")
     return Tree(
         **bodies,
         origin=origins(parent, prismatic),
         periodic=periodic_coordinates(coordinate, prismatic, bodies["ratio"], len(coordinates)),
-        armature=coordinate_armature(model, ties, coordinates),
+        armature=armature,
         group=group,
         groups=int(group.max()) + 1,
         ends=block_ends(group),
@@ -118,19 +123,6 @@ def place_of_frame(model: pin.Model, frame: str, robot: str) -> tuple[int, Float
         return -1, R, at
     turn = z_to(joint_axis(model, joint)[1])
     return joint - 1, turn.T @ R, turn.T @ at
-
-
-def coordinate_armature(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...]) -> Floats:
-    """Armature (n,) of each coordinate: its own and that of its followers times the squares of their ratios."""
-    of_model = np.asarray(model.armature, dtype=float)
-    armature = np.array([of_model[model.joints[joint].idx_v] for joint in coordinates])
-    for tie in ties:
-        armature[coordinates.index(tie.leader)] += (
-            tie.ratio * tie.ratio * float(of_model[model.joints[tie.follower].idx_v])
-        )
-    if not (np.isfinite(armature).all() and (armature >= 0.0).all()):
-        raise RobotError(f"armature must be finite and >= 0, got {armature}")
-    return armature
 
 
 def to_pinocchio(model: pin.Model, positions: Floats) -> Floats:

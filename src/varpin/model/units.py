@@ -58,20 +58,23 @@ def typed_in_degrees(angles: Floats) -> NDArray[np.bool_]:
     return (np.abs(angles) > _TURNS) & (np.abs(angles) < _DEGREES) & (tenths == np.round(tenths))
 
 
-def degrees_hint(robot: Robot, name: str, q: Floats) -> str:
-    """A sentence about the joint of a configuration (n,) [rad or m] that looks most like degrees; empty if none does.
+def degrees_hint(robot: Robot, name: str, values: Floats, *, speed: bool = False) -> str:
+    """A sentence about the joint whose value (n,) [rad or m, or that a second] looks most like degrees, or none.
 
-    Joints without limits may have turned many times in an earlier motion. Of these only typed values count.
+    Joints without limits may have turned many times in an earlier motion. Of these only typed values count; of a
+    ``speed`` only typed values beyond its limit.
     """
-    lower, upper = robot.position_limits
+    lower, upper = (-robot.velocity_limit, robot.velocity_limit) if speed else robot.position_limits
+    outside, typed = (values < lower) | (values > upper), typed_in_degrees(values)
     bounded = np.isfinite(lower) | np.isfinite(upper)
-    wrong: NDArray[np.bool_] = ~robot.slides & np.where(bounded, (q < lower) | (q > upper), typed_in_degrees(q))
-    angles = np.where(wrong, np.abs(q), 0.0)
-    joint = int(np.argmax(angles))
+    wrong: NDArray[np.bool_] = ~robot.slides & (outside & typed if speed else np.where(bounded, outside, typed))
+    angles = np.where(wrong, np.abs(values), 0.0)
+    joint, per = int(np.argmax(angles)), "/s" if speed else ""
     if not looks_like_degrees(float(angles[joint])):
         return ""
-    turns = f"{angles[joint] / (2.0 * math.pi):.0f} turns"
-    return f"{name} of {robot.joint_names[joint]!r} is {q[joint]:.4g} rad, {turns}, and looks like degrees: {ADVICE}"
+    turns = f"{angles[joint] / (2.0 * math.pi):.0f} turns{per}"
+    value, joint_name = values[joint], robot.joint_names[joint]
+    return f"{name} of {joint_name!r} is {value:.4g} rad{per}, {turns}, and looks like degrees: {ADVICE}"
 
 
 def longest_reach(robot: Robot, *, slides: bool = True, centers: bool = True) -> float:

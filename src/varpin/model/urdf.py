@@ -20,7 +20,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.parsers import expat
 
 import numpy as np
@@ -34,9 +34,6 @@ from varpin.model.units import NO_LIMIT, typed_in_degrees
 from varpin.support.frozen import Frozen
 
 logger = logging.getLogger(__name__)
-
-# A link with less than this share of the mass of all links on its joint is massless, but for rounding.
-_ROUNDING = 1e-12
 
 # A bound in words that Pinocchio reads and :class:`varpin.Robot` takes as none.
 _NONE = "1e308"
@@ -61,44 +58,26 @@ class Mimic(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Inertial(Frozen):
-    """Mass and inertia of a link, as Pinocchio reads them.
-
-    Attributes:
-        link: Name of the link.
-        mass: Mass [kg].
-        center: Centre of mass (3,) in the link's frame [m].
-        inertia: Inertia (3, 3) about the centre of mass, in the link's axes [kg m^2].
-    """
+    """Mass and inertia of a link, as Pinocchio reads them."""
 
     link: str
-    mass: float
-    center: NDArray[np.float64]
-    inertia: NDArray[np.float64]
+    mass: float  # [kg]
+    center: NDArray[np.float64]  # centre of mass (3,) in the link's frame [m]
+    inertia: NDArray[np.float64]  # (3, 3) about the centre of mass, in the link's axes [kg m^2]
 
 
 @dataclass(frozen=True, eq=False)
 class Urdf:
-    """A URDF file, read by :func:`read_urdf`.
-
-    Attributes:
-        path: Path of the file.
-        root: The ``<robot>`` element, with prefixes of names as written.
-        model: Pinocchio's model, in which mimic joints are independent.
-        mimics: Mimic elements by joint.
-        inertials: The inertias of the links that have one.
-        faults: What Pinocchio leaves out of links and joints, in words; empty if it leaves out nothing.
-        remarks: How the file is read where that is not plain, one sentence a kind.
-        notes: What of the file has no effect on purpose, likewise.
-    """
+    """A URDF file, read by :func:`read_urdf`."""
 
     path: Path
-    root: ET.Element = field(repr=False)
-    model: pin.Model = field(repr=False)
-    mimics: Mapping[str, Mimic]
-    inertials: tuple[Inertial, ...] = field(repr=False)
-    faults: tuple[str, ...]
-    remarks: tuple[str, ...]
-    notes: tuple[str, ...]
+    root: ET.Element = field(repr=False)  # with prefixes of names as written
+    model: pin.Model = field(repr=False)  # in which mimic joints are independent
+    mimics: Mapping[str, Mimic]  # by joint
+    inertials: tuple[Inertial, ...] = field(repr=False)  # of the links that have one
+    faults: tuple[str, ...]  # what Pinocchio leaves out of links and joints, in words
+    remarks: tuple[str, ...]  # how the file is read where that is not plain, one sentence a kind
+    notes: tuple[str, ...]  # what of the file has no effect on purpose, likewise
 
     @property
     def loops(self) -> tuple[tuple[str, str], ...]:
@@ -111,9 +90,9 @@ class Urdf:
 def read_urdf(path: Path, text: str | None = None) -> Urdf:
     """Read a URDF file, or its text if that is another one.
 
-    XML is read as leniently as Pinocchio reads it: prefixes need no namespace, and comments may contain ``--``.
+    As for Pinocchio, prefixes need no namespace, and comments may contain ``--``; the rest of the file must be XML.
     """
-    root = read_xml(path, text)
+    root = read_xml(path, text, "URDF")
     parent: dict[str, str] = {}
     for joint in root.findall("joint[child]"):
         link, name = joint.findall("child")[0].get("link", ""), joint.get("name", "")
@@ -123,28 +102,23 @@ def read_urdf(path: Path, text: str | None = None) -> Urdf:
                 "varpin takes trees, no closed loops"
             )
     mimics = {joint.get("name", ""): _mimic(joint, path) for joint in root.findall("joint[mimic]")}
-    remarks = *_remarks(root), *_unlimited(root)
+    remarks = tuple(_remarks(root))
     soft = _joints_with(root, "safety_controller")
     notes = (f"soft limits of <safety_controller> have no effect: {listed(soft, 'joints')}",) if soft else ()
-    model, complaint = _model(root, path)
+    model, inertials, complaint = _model(root, path)
     faults = (f"Pinocchio reads links in part: {complaint}",) if complaint else ()
-    return Urdf(path, root, model, mimics, _inertials(root, model), faults, remarks, notes)
+    return Urdf(path, root, model, mimics, inertials, faults, remarks, notes)
 
 
-def _model(root: ET.Element, path: Path) -> tuple[pin.Model, str]:
-    """Pinocchio's model of a file, and its complaints."""
-    model, complaint = None, ""
-    small = ET.Element("robot" if root.tag == "robot" else "none", _head(root))
+def _model(root: ET.Element, path: Path) -> tuple[pin.Model, tuple[Inertial, ...], str]:
+    """Pinocchio's model of a file, the inertias of its links, and Pinocchio's complaints."""
+    small = ET.Element("robot", _head(root))
     for part in root.iterfind("*"):
         if part.tag in ("link", "joint"):
             kept = ET.SubElement(small, part.tag, part.attrib)
             kept.extend(part if part.tag == "joint" else part.findall("inertial"))
-    with captured_stderr() as complaints:
-        try:
-            model = pin.buildModelFromXML(ET.tostring(small, encoding="unicode"))
-        except (ValueError, RuntimeError, IndexError) as error:
-            complaint = str(error)
-        complaint = "; ".join(complaints()) or complaint
+    text = ET.tostring(small, encoding="unicode")
+    model, complaint = _built(text)
     expand = "${" in complaint or "$(" in complaint or (model is None and bool(_xacro(root)))
     complaint = textwrap.shorten(complaint, _COMPLAINT)
     if re.search(r"\d,\d", complaint):
@@ -157,31 +131,24 @@ def _model(root: ET.Element, path: Path) -> tuple[pin.Model, str]:
     bodies = {frame.name for frame in model.frames if frame.type == pin.FrameType.BODY}
     if lost := [repr(link.get("name")) for link in root.findall("link") if link.get("name") not in bodies]:
         raise RobotError(f"{path}: links {listed(lost, 'links')} are on a loop of joints without a root")
-    return model, complaint
-
-
-def _inertials(root: ET.Element, model: pin.Model) -> tuple[Inertial, ...]:
-    """The inertias of the links that have one."""
+    # Pinocchio merges links on fixed joints into one body: with joints that move, each link is one.
+    apart = _built(text.replace(' type="fixed"', ' type="continuous"'))[0]
     given = {link.get("name", "") for link in root.findall("link[inertial]")}
-    # Pinocchio merges links on fixed joints into one body, whose parts are in the frames of these joints.
-    fixed = [frame for frame in model.frames if frame.type == pin.FrameType.FIXED_JOINT and frame.inertia.mass]
     found = []
-    for frame in (frame for frame in model.frames if frame.type == pin.FrameType.BODY and frame.name in given):
-        up = model.frames[frame.parentFrame]
-        body = up.inertia if up.inertia.mass else frame.inertia
-        if up.type == pin.FrameType.JOINT:
-            body = model.inertias[frame.parentJoint]
-            if parts := [part for part in fixed if part.parentJoint == frame.parentJoint]:
-                body = _without(body, [part.placement.act(part.inertia) for part in parts])
-        if body.mass or body.inertia.any():
+    for frame in apart.frames:
+        body = apart.inertias[frame.parentJoint]
+        if frame.type == pin.FrameType.BODY and frame.name in given and (body.mass or body.inertia.any()):
             found.append(Inertial(frame.name, body.mass, np.array(body.lever), np.array(body.inertia)))
-    return tuple(found)
+    return model, tuple(found), complaint
 
 
-def _without(body: pin.Inertia, parts: Sequence[pin.Inertia]) -> pin.Inertia:
-    """A body without some of its parts; zero if they leave rounding errors alone."""
-    rest = body.toDynamicParameters() - sum(part.toDynamicParameters() for part in parts)
-    return pin.Inertia.FromDynamicParameters(rest) if rest[0] > _ROUNDING * body.mass else pin.Inertia.Zero()
+def _built(text: str) -> tuple[Any, str]:
+    """Pinocchio's model of a URDF, None if it has none, and its complaints."""
+    with captured_stderr() as complaints:
+        try:
+            return pin.buildModelFromXML(text), "; ".join(complaints())
+        except (ValueError, RuntimeError, IndexError) as error:
+            return None, "; ".join(complaints()) or str(error)
 
 
 def build_shapes(
@@ -244,8 +211,8 @@ def _missing_meshes(urdf: Urdf, packages: Packages) -> dict[str, str]:
     return dict.fromkeys(missing, f"{message}looked beside the file and in {places} (package_dirs=[...] adds)")
 
 
-def read_xml(path: Path, text: str | None = None) -> ET.Element:
-    """The root element of an XML file, with prefixes as written."""
+def read_xml(path: Path, text: str | None = None, kind: str = "") -> ET.Element:
+    """The elements of an XML file without texts, prefixes as written; the root of a URDF or an SRDF is ``<robot>``."""
     try:
         content = path.read_bytes() if text is None else text.encode()
     except OSError as error:
@@ -255,14 +222,16 @@ def read_xml(path: Path, text: str | None = None) -> ET.Element:
     # Comments often contain "--", which XML forbids. Their line breaks stay, for line numbers.
     content = _COMMENT.sub(lambda found: found[1] or b"\n" * found[0].count(b"\n"), content.lstrip(b" \t\r\n"))
     builder, parser = ET.TreeBuilder(), expat.ParserCreate()
-    parser.buffer_text = True
     parser.StartElementHandler = lambda tag, has: builder.start(tag, {key: text.strip() for key, text in has.items()})
-    parser.EndElementHandler, parser.CharacterDataHandler = builder.end, builder.data
+    parser.EndElementHandler = builder.end
     try:
         parser.Parse(content, True)
     except (expat.ExpatError, LookupError) as error:
-        raise RobotError(f"{path} is not well-formed XML: {error}") from None
-    return builder.close()
+        raise RobotError(f"{path} is {f'not well-formed XML: {error}' if content else 'empty'}") from None
+    root = builder.close()
+    if kind and root.tag != "robot":
+        raise RobotError(f"{path} is not a {kind}: its root element is <{root.tag}>, not <robot>")
+    return root
 
 
 def _xacro(root: ET.Element) -> dict[str, None]:
@@ -271,37 +240,11 @@ def _xacro(root: ET.Element) -> dict[str, None]:
     return dict.fromkeys(f"<{part.tag}>" for part in root.iter() if part.tag.partition(":")[0] in prefixes)
 
 
-def _unlimited(root: ET.Element) -> Iterator[str]:
-    """Replace the limits by which exporters mean none, with a sentence about them.
+def _remarks(root: ET.Element) -> Iterator[str]:
+    """How limits and elements without effect are read, one sentence a kind; limits that mean none are replaced.
 
     Two bounds of 0 are none as well, as a URDF before version 1.2 without bounds is read.
     """
-    stated, told = root.get("version") == "1.2", []
-    for joint in root.findall("joint"):
-        name, limit = joint.get("name", ""), joint.find("limit")
-        if limit is None and joint.get("type") in ("revolute", "prismatic"):
-            limit = ET.SubElement(joint, "limit")
-        if limit is None:
-            continue
-        bounded = bool({"lower", "upper"} & set(limit.keys()))
-        minus_one = _number(limit.get("lower")) == _number(limit.get("upper")) == -1.0
-        for key in ("lower", "upper", "effort", "velocity"):
-            word, drive = limit.get(key), key in ("effort", "velocity")
-            if word is None and (stated if drive else bounded or not stated):
-                continue
-            value = _number(word)
-            none = word is None or word.lower() in _WORDS or math.isinf(value)
-            none |= value < 0.0 if drive else minus_one
-            if joint.get("type") != "fixed" and (none or (not drive and abs(value) > NO_LIMIT)):
-                told.append(f"no {key} of {name!r}" if word is None else f"{key} {word} of {name!r}")
-            if none:
-                limit.set(key, f"-{_NONE}" if key == "lower" else _NONE)
-    if told:
-        yield f"limits that are missing, infinite, negative or huge count as none: {listed(told, 'limits')}"
-
-
-def _remarks(root: ET.Element) -> Iterator[str]:
-    """How limits and elements without effect are read, one sentence a kind."""
     left = _xacro(root)
     left |= {
         f"<{part.tag} {key}={value!r}>": None
@@ -311,18 +254,36 @@ def _remarks(root: ET.Element) -> Iterator[str]:
     }
     if left:
         yield f"leftover xacro elements have no effect: {listed(left, 'kinds')}"
-    degrees, ignored = [], []
-    for joint in root.findall("joint[limit]"):
-        name, kind, limit = repr(joint.get("name", "")), joint.get("type"), joint.findall("limit")[0]
+    stated, none, degrees, ignored = root.get("version") == "1.2", [], [], []
+    for joint in root.findall("joint"):
+        name, kind, limit = repr(joint.get("name", "")), joint.get("type"), joint.find("limit")
+        if limit is None and kind in ("revolute", "prismatic"):
+            limit = ET.SubElement(joint, "limit")
+        if limit is None:
+            continue
         low, high = (_number(limit.get(key)) for key in ("lower", "upper"))
         if kind == "continuous" and low < high and high - low < NO_LIMIT:
             ignored.append(name)
         if kind == "revolute" and typed_in_degrees(np.array([low, high])).any():
             degrees.append(f"{low:g} to {high:g} of {name}")
+        bounded, minus_one = bool({"lower", "upper"} & set(limit.keys())), low == high == -1.0
+        for key in ("lower", "upper", "effort", "velocity"):
+            word, drive = limit.get(key), key in ("effort", "velocity")
+            if word is None and (stated if drive else bounded or not stated):
+                continue
+            value = _number(word)
+            means_none = word is None or word.lower() in _WORDS or math.isinf(value)
+            means_none |= value < 0.0 if drive else minus_one
+            if means_none:
+                limit.set(key, f"-{_NONE}" if key == "lower" else _NONE)
+            if kind != "fixed" and (means_none or (not drive and abs(value) > NO_LIMIT)):
+                none.append(f"no {key} of {name}" if word is None else f"{key} {word} of {name}")
     if degrees:
         yield f"limits look like degrees, and URDF has radians: {listed(degrees, 'joints')}"
     if ignored:
         yield f"limits of continuous joints have no effect (type revolute has limits): {listed(ignored, 'joints')}"
+    if none:
+        yield f"limits that are missing, infinite, negative or huge count as none: {listed(none, 'limits')}"
     if named := _joints_with(root, "joint_properties"):
         yield f"<joint_properties> has no effect, URDF calls it <dynamics>: {listed(named, 'joints')}"
 

@@ -74,7 +74,7 @@ def expand(
         try:
             text = str(xacro.process_file(str(path), mappings=given).toxml())
         except Exception as error:  # Expressions in the file may raise anything.
-            if found := _UNDEFINED.search(_told(error)):
+            if found := _UNDEFINED.search(str(error)):
                 raise RobotError(
                     f"{path} needs the xacro argument {found[1]!r}, which has no default: "
                     f"give xacro_args={{{found[1]!r}: ...}}"
@@ -103,6 +103,8 @@ def _told(error: Exception) -> str:
     """What xacro says of an error, without names of Python classes."""
     if isinstance(error, expat.ExpatError):
         return f"it is not well-formed XML: {error}"
+    # Of an error that wraps another one with the same message, the other one tells all.
+    error = getattr(error, "exc", None) or error
     return " ".join(re.sub(r"<class '[^']*'>:?|^.*\[Errno \d+\]", "", str(error)).split()) or type(error).__name__
 
 

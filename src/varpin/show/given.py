@@ -37,8 +37,8 @@ def frame_names(option: str, robots: Sequence[Robot], names: bool | str | Sequen
     for name in wanted:
         if not isinstance(name, str):
             raise InputError(f"{option} must be names of frames, got {name!r}")
-        if not any(robot.free_model.existFrame(name) for robot in robots):
-            known = dict.fromkeys(frame.name for robot in robots for frame in robot.free_model.frames)
+        if not any(robot.model.existFrame(name) for robot in robots):
+            known = dict.fromkeys(frame.name for robot in robots for frame in robot.model.frames)
             owners = ", ".join(repr(robot.name) for robot in robots)
             raise UnknownFrame(name, known, f"{option}: no frame of robot {owners} is")
-    return [tuple(name for name in wanted if robot.free_model.existFrame(name)) for robot in robots]
+    return [tuple(name for name in wanted if robot.model.existFrame(name)) for robot in robots]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from inspect import signature
 from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
@@ -20,11 +21,10 @@ from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot, check_inertia, longest_reach, readable_geometry
 from varpin.model.inertia import fault, inertials_of, one_of_each, principal_moments
-from varpin.model.loading import assemble
+from varpin.model.loading import load_robot, unchecked_robot
 from varpin.model.meshes import shape_points
 from varpin.model.mimic import joint_index
 from varpin.model.robot import limits_of
-from varpin.model.sources import describe
 from varpin.model.tree import is_unbounded, joint_axis
 from varpin.model.urdf import listed
 from varpin.support import markup
@@ -51,8 +51,6 @@ SIZE_RATIO = 1.5
 MESH_RATIOS = (0.01, 10.0)
 # Density of osmium, the densest element [kg/m^3].
 DENSITY = 22_600.0
-# Options of :func:`varpin.load_robot` that say how a file is read; the others change the robot.
-_READING = frozenset({"package_dirs", "mimic", "xacro_args", "srdf"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,12 +258,13 @@ def inspect_robot(
             robot.
     """
     if isinstance(source, Robot):
-        if loading:
-            raise InputError(f"{', '.join(loading)}: options of loading, and the robot is already loaded")
+        if given := [name for name, value in loading.items() if value is not None]:
+            raise InputError(f"{', '.join(given)}: options of loading, and the robot is already loaded")
         robot = source
     else:
-        whole = describe(source, **{name: loading.pop(name) for name in _READING & loading.keys()})
-        robot = assemble(whole, **loading)
+        options = signature(load_robot).bind(source, **loading)
+        options.apply_defaults()
+        robot = unchecked_robot(**options.arguments)
     scene = Scene(robot, gravity=gravity, damping=0.0, constraints=())
     configuration = joint_array("q", 0.0 if q is None else q, robot.joint_names, uniform=True)
     velocity = joint_array("v", 0.0 if v is None else v, robot.joint_names, uniform=True)
@@ -311,7 +310,7 @@ def _condition_number(M: Floats) -> float:
 
 
 def _joints(robot: Robot) -> tuple[JointReport, ...]:
-    model = robot.free_model
+    model = robot.model
     ties = {tie.follower: tie for tie in robot.ties}
     reports = []
     for joint in range(1, model.njoints):
@@ -328,7 +327,7 @@ def _joints(robot: Robot) -> tuple[JointReport, ...]:
 
 def _links(robot: Robot) -> tuple[LinkReport, ...]:
     # The links of the URDF: Pinocchio merges links on fixed joints into one body, which can hide a faulty inertia.
-    model = robot.free_model
+    model = robot.model
     joints = joint_index(model)
     joints |= {frame.name: frame.parentJoint for frame in model.frames if frame.type == pin.FrameType.BODY}
     return tuple(
@@ -352,7 +351,7 @@ _KINDS: dict[pin.FrameType, FrameKind] = {
 
 
 def _frames(robot: Robot) -> tuple[FrameReport, ...]:
-    model, reports = robot.free_model, {}
+    model, reports = robot.model, {}
     for index, frame in enumerate(model.frames):
         # The first frame is the world. Of several frames with the same name, varpin finds the first.
         if index == 0 or frame.name in reports:
@@ -366,9 +365,9 @@ def _frames(robot: Robot) -> tuple[FrameReport, ...]:
 
 
 def _mass_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
-    tree, names = robot.tree, [part.link for part in inertials_of(robot.free_model)]
+    tree, names = robot.tree, [part.link for part in inertials_of(robot.model)]
     for body, mass in enumerate(tree.mass):
-        name, joint = names[body], robot.free_model.names[body + 1]
+        name, joint = names[body], robot.model.names[body + 1]
         if mass == 0.0:
             carries = "only the links that it carries give the joint inertia"
             if body not in tree.parent:
@@ -387,7 +386,7 @@ def _inertia_warnings(
     around: dict[int, list[Floats]] = {}
     for shape in shapes.geometryObjects:
         around.setdefault(shape.parentJoint, []).append(shape_points(shape))
-    frames = {frame.name: frame for frame in robot.free_model.frames if frame.type == pin.FrameType.BODY}
+    frames = {frame.name: frame for frame in robot.model.frames if frame.type == pin.FrameType.BODY}
     for link in links:
         if not link.joint:
             continue
@@ -428,7 +427,7 @@ def _mesh_warnings(robot: Robot, shapes: pin.GeometryModel) -> Iterator[str]:
         return
     shape, size = max(sizes.items(), key=lambda own: own[1])
     if not MESH_RATIOS[0] * reach <= size <= MESH_RATIOS[1] * reach:
-        name, link = Path(shape.meshPath).name or shape.name, robot.free_model.frames[shape.parentFrame].name
+        name, link = Path(shape.meshPath).name or shape.name, robot.model.frames[shape.parentFrame].name
         yield (
             f"mesh {name!r} of link {link!r} is {size:.3g} m long, where the arm reaches {reach:.3g} m: if it is not "
             "in metres, its scale= must make it so"

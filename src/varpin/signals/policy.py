@@ -245,7 +245,7 @@ class LinearPolicy(Frozen):
         """
         if self.period is None:
             return self.hold
-        hold = max(1, round(self.period / dt))
+        hold = max(1, round(min(self.period / dt, 1e15)))
         if abs(hold * dt - self.period) > 1e-9 * self.period:
             raise InputError(
                 f"the policy has intervals of {self.period:g} s, which dt = {dt:g} s does not divide: "

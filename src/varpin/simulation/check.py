@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Literal
 
 import numpy as np
 
@@ -17,11 +16,10 @@ from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands
 from varpin.errors import AssemblyError, SingularMassMatrix
 from varpin.finding import Finding
-from varpin.integrators import ExplicitEuler, Gauss, Integrator, Radau, Reference, RungeKutta4
+from varpin.integrators import Gauss, Integrator, Radau, Reference, RungeKutta4
 from varpin.integrators.base import drifts, noise_impulses
 from varpin.integrators.collocation import MOST_STAGES
 from varpin.integrators.reference import TIGHTEST
-from varpin.integrators.variational import Variational
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
@@ -31,8 +29,8 @@ from varpin.signals.controls import Controls, commands_of
 from varpin.signals.functions import Sampled, left_by_stages
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.gate import proven_error
-from varpin.simulation.law import Law, law_of
 from varpin.simulation.limits import beyond_limits
+from varpin.simulation.loop import Law, law_of
 from varpin.simulation.spectrum import contact_rate, fastest_rate, speed_scales, travel_scales
 from varpin.simulation.start import finer
 from varpin.simulation.velocity_noise import wrong_spread
@@ -76,13 +74,10 @@ def check(
         scene: The scene of the motion.
         integrator: The integrator of the motion.
         trajectory: The motion, without warnings.
-        controls: What the controls were, where they are more than the motion has recorded: a function of time, lines
-            between nodes, or linear feedback, which acts on the repetition too. Others are those of the record, held.
-        restart: Steps after which the repetition begins anew at a node of the motion, where a controller has corrected
-            the errors before it; 0 for none.
+        controls: Those that the record does not have whole: functions of time, lines, feedback.
+        restart: Steps after which a controller corrects errors: the repetition begins anew there; 0 for none.
         known: The error, if it is known (N + 1, n): nothing is repeated.
-        hold: The period of a control law in steps, 0 for none. Where the record tells the law, it acts on the
-            repetition; else its recorded values are held.
+        hold: The period of a control law in steps, 0 for none.
     """
     function = controls if isinstance(controls, Sampled) else None
     extremes = None if function is None else function.whole.extremes
@@ -134,11 +129,9 @@ def closer(
 ) -> tuple[Integrator, int, float]:
     """The method of a repetition, its steps in one of the motion's, and the share of the motion's error that it has.
 
-    It has two stages more than a method of the motion's order has. Radau methods damp what is faster than the step, so
-    they do not share the ringing of others. They keep no constraints; those of Gauss do. More stages resolve neither
-    kinks of forces nor what dampers take faster than the step, so scenes with forces and L-stable methods are repeated
-    in half steps, too. Runge-Kutta's method halves its step, and is the one for controls that are ``fed`` back on
-    (q, v); but functions of time that are ``sampled`` are not called again for it.
+    Two stages more than the motion's order needs, of Radau, which does not ring. More stages resolve neither kinks nor
+    fast dampers: those take half steps, too. Runge-Kutta's method halves its step, and is for controls ``fed`` back on
+    (q, v), but not for functions of time that are ``sampled``.
     """
     # Steps that guards divided are as many shorter ones.
     taken = np.maximum(trajectory.statistics.substeps, 1).sum() / max(trajectory.steps, 1)
@@ -148,8 +141,7 @@ def closer(
         factor = 0.1 if 0.1 * integrator.rtol >= TIGHTEST else 10.0
         other = Reference(factor * integrator.rtol, None if integrator.atol is None else factor * integrator.atol)
         return other, 1, factor
-    if trajectory.noisy and isinstance(integrator, ExplicitEuler):
-        # Its kicks come after the step.
+    if trajectory.noisy and integrator.kicks_after:
         return integrator, 2, 0.5
     own = isinstance(integrator, RungeKutta4)
     if (own and not sampled) or (fed and not integrator.variational):
@@ -157,12 +149,8 @@ def closer(
     stages = (integrator.order + 1) // 2 + _MORE
     if stages > MOST_STAGES:
         stages, parts = MOST_STAGES, 2 * parts
-    kick = _kick(integrator)
+    kick = integrator.kick
     return (Gauss(stages, kick=kick) if scene.constraints else Radau(stages, kick=kick)), parts, 0.0
-
-
-def _kick(integrator: Integrator) -> Literal["left", "split", "held"]:
-    return integrator.kick if isinstance(integrator, Variational) else "left"
 
 
 def repeated(
@@ -251,14 +239,10 @@ def _commands(
 
 
 def noise_unknown(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bool:
-    """Whether a repetition cannot have the noise of a motion, so that its error stays unknown.
-
-    That is so under constraints for kicks of fields in Python, or of controls that change within steps, and for split
-    kicks of fields that depend on the velocity, which the record has after the kick alone.
-    """
-    if not trajectory.noisy or _kick(integrator) == "held":
+    """Whether a repetition cannot have the noise of a motion, so that its error stays unknown."""
+    if not trajectory.noisy or integrator.holds_noise:
         return False
-    if scene.noise.velocity_dependent and _kick(integrator) == "split":
+    if scene.noise.velocity_dependent and integrator.kick == "split":
         return True
     if not scene.constraints:
         return False
@@ -276,8 +260,7 @@ def _noise(
         drawn = np.zeros((1, N * parts, trajectory.dw.shape[1]))
         drawn[0, ::parts] = trajectory.dw
         return drawn, None
-    # Explicit Euler's kicks come after the step.
-    before = 0.0 if isinstance(integrator, ExplicitEuler) else integrator.left
+    before = 0.0 if integrator.kicks_after else integrator.left
 
     def impulses(share: float, node: Integers) -> Floats:
         at = trajectory.q[node], trajectory.v[node]
@@ -301,10 +284,7 @@ def error_findings(
     controls: Controls | Commands = None,
     hold: int = 0,
 ) -> tuple[Finding, ...]:
-    """The warning of a motion's error, if it is large, from errors of q and v at its nodes (N + 1, n).
-
-    ``controls`` are those of :func:`check`; ``hold`` is the period of a control law in steps, 0 for none.
-    """
+    """The warning of a motion's error, if it is large, from errors of q and v at its nodes (N + 1, n)."""
     cure = functools.partial(_cure, scene, integrator, trajectory, controls, hold)
     known = np.asarray(np.isfinite(off).all(axis=1))
     last = int(known.argmin()) if not known.all() else len(known)

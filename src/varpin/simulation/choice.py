@@ -55,9 +55,6 @@ def usual_kick(scene: Scene) -> Literal["left", "held"]:
 
 
 def stronger(chosen: Iterable[Integrator]) -> Integrator:
-    """The one of some integrators chosen by the functions above that is right for all their motions.
-
-    The default where there are none.
-    """
+    """The one of some integrators chosen above that is right for all their motions; the default for none."""
     ranks = {str(member): rank for rank, member in enumerate((_NOISY, _USUAL, _SWINGING, _STOPPING))}
     return max(chosen, key=lambda own: ranks[str(own)], default=_USUAL)

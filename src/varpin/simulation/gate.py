@@ -39,11 +39,7 @@ _SHORT_STEPS = 4
 
 
 def proven_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> float | None:
-    """Four times a motion's error to first order [rad or m], if it is small beside the travel; None where not known.
-
-    It is not known under constraints and noise, with forces that have kinks or are in Python, and for integrators that
-    choose their own steps.
-    """
+    """Four times a motion's error to first order [rad or m], if it is small beside the travel; None where not known."""
     if isinstance(integrator, Reference) or not trajectory.steps or scene.robot.dof > _JOINTS:
         return None
     split = trajectory.statistics.substeps.max() > 1

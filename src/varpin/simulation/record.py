@@ -224,21 +224,6 @@ def located(
     return error
 
 
-def next_command(commands: Commands, record: MotionRecord) -> Commands:
-    """The command of the next step alone: a new decision, or the last control while it is held.
-
-    In scenes with kinematic inputs it is that of all steps of a decision.
-    """
-    decision, held = divmod(record.steps, commands.hold)
-    if commands.hold > 1 and record.scene.inputs:
-        # A kinematic input is on its way over all steps of a decision.
-        return rows(commands, decision, decision + 1)
-    if held:
-        return open_loop(record.last.u[-1:])
-    before = record.last.u[None, -1] if record.steps else None
-    return rows(commands, decision, decision + 1, before)._replace(hold=1)
-
-
 def next_block(
     controls: Controls | ControlLaw, commands: Commands, record: MotionRecord, most: int, left: int
 ) -> Commands:
@@ -265,11 +250,13 @@ def next_block(
             if error.step == first:
                 raise
             return controls.commands(first, error.step - first, times)
-    if most == 1 and not len(commands.stage_times):
-        return next_command(commands, record)
-    first = record.steps // commands.hold
+    first, held = divmod(record.steps, commands.hold)
     before = record.last.u[None, -1] if record.steps else None
-    return rows(commands, first, first + max(1, most // commands.hold), before)
+    block = rows(commands, first, first + max(1, most // commands.hold), before)
+    # A kinematic input, or a line, is on its way over all steps of a decision.
+    if most > 1 or commands.hold == 1 or record.scene.inputs or len(commands.stage_times):
+        return block
+    return open_loop(record.last.u[-1:]) if held else block._replace(hold=1)
 
 
 class Motions:

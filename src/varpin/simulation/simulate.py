@@ -132,7 +132,7 @@ def simulate(
     accuracy: Accuracy | None = None
     error: Floats | None = None
     unmet: tuple[Finding, ...] = ()
-    given = q0
+    given = q0, v0
     moved: tuple[Finding, ...] = ()
     if scene.constraints:
         q0, v0, moved = on_constraints(scene, q0, v0)
@@ -199,7 +199,7 @@ def simulate(
         elif known is not None:
             motion = motion.with_error(known)
         # Values in wrong units explain all else. Without controls servos hold the start.
-        found = [*in_other_units(scene, given, motion.u), *found, *moved]
+        found = [*in_other_units(scene, *given, motion.u), *found, *moved]
         motion = motion.changed(warnings=ranked(found), accuracy=accuracy)
     except KeyboardInterrupt:
         raise Interrupted(motion.changed(accuracy=accuracy)) from None

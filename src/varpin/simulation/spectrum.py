@@ -75,7 +75,7 @@ def pulls_fast(scene: Scene, q: Floats, forces: Floats, dt: float) -> bool:
     if scene.couplings:
         slopes = scene.core.coupled_forces(q, still)[1]
         K += 0.5 * (slopes + np.swapaxes(slopes, 1, 2))
-    return not _definite(masses(scene, q) + dt**2 * np.array([K, -K]))
+    return not _definite(masses(scene, q) + dt * dt * np.array([K, -K]))
 
 
 def rate_at_rest(scene: Scene, q: Floats) -> float:

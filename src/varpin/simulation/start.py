@@ -21,9 +21,9 @@ _ROUNDING = 1e-9
 _MULTIPLE = 1e-9
 
 
-def in_other_units(scene: Scene, q0: Floats, controls: Floats | None = None) -> tuple[Finding, ...]:
-    """A warning of an initial state (n,) that looks like degrees, else of such positions in controls (N, m)."""
-    if sentence := degrees_hint(scene.robot, "q0", q0):
+def in_other_units(scene: Scene, q0: Floats, v0: Floats, controls: Floats | None = None) -> tuple[Finding, ...]:
+    """A warning of an initial state (n,), (n,) that looks like degrees, else of such positions in controls (N, m)."""
+    if sentence := degrees_hint(scene.robot, "q0", q0) or degrees_hint(scene.robot, "v0", v0, speed=True):
         return (Finding("start in degrees", sentence),)
     if controls is None or not len(controls) or not scene.holding.any():
         return ()
@@ -67,13 +67,7 @@ def on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Floats
 def time_steps(
     dt: float | None, steps: int | None, duration: float | None, *, choosable: bool = False
 ) -> tuple[float, int]:
-    """The time step [s] and the number of steps, from two of the three arguments.
-
-    Args:
-        dt: Time step [s].
-        steps: Number of steps.
-        duration: Their product [s].
-        choosable: Whether a tolerance may be given instead, for the message.
+    """The time step [s] and the number of steps, from two of the three; ``choosable`` if a tolerance may choose them.
 
     Raises:
         InputError: Not two are given, one is invalid, or the duration is no multiple of the step.
@@ -101,11 +95,7 @@ def time_steps(
 
 
 def finer(trajectory: Trajectory, parts: int) -> tuple[int, str]:
-    """At least so many parts of a motion's steps, and the argument that asks for them, for example ``dt = 0.0025 s``.
-
-    The numbers of digits and parts are small: what is written divides the step of the motion. Where no short number
-    does, the argument is the number of steps.
-    """
+    """At least so many parts of a motion's steps, and the argument that asks for them: a short dt, or else steps."""
     for more in range(parts, 2 * parts + 1):
         dt = trajectory.dt / more
         if math.isclose(float(f"{dt:.4g}"), dt, rel_tol=_MULTIPLE):

@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.core.arrays import Commands
 from varpin.errors import InputError, StepError, VarpinError
 from varpin.finding import Finding
 from varpin.integrators import (
@@ -33,7 +32,7 @@ from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.signals.commands import held_in_parts, open_loop
+from varpin.signals.commands import held_in_parts
 from varpin.signals.controls import Controls, commands_of, control_rows
 from varpin.signals.functions import ControlLaw, Sampled
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
@@ -203,8 +202,7 @@ class Ladder:
     def for_tolerance(self, wish: float) -> tuple[list[Trial], bool]:
         """The methods at the steps that meet an error [rad or m], the cheapest first, and whether one does.
 
-        The first was tried at its steps; others may be predicted. If none meets the error, they are at the steps of
-        their least errors, the most accurate first.
+        If none meets it, they are at the steps of their least errors, the most accurate first.
         """
         self._find_first()
         while not self.late():
@@ -285,16 +283,15 @@ class _Search:
     def __init__(self, scene: Scene, q0: Floats, v0: Floats, duration: float, controls: Controls) -> None:
         self.scene, self.q0, self.v0, self.duration = scene, q0, v0, duration
         self.controls: Floats | LinearPolicy | OpenLoop | FirstOrderHold
-        self.rows = 1
-        if isinstance(controls, LinearPolicy | OpenLoop | FirstOrderHold):
-            self.controls = controls
+        if isinstance(controls, OpenLoop):
+            self.controls, self.rows = controls, 1
+        elif isinstance(controls, LinearPolicy):
+            self.controls, self.rows = controls, len(controls.gains)
+        elif isinstance(controls, FirstOrderHold):
+            self.controls, self.rows = controls, len(controls.u) - 1
         else:
             self.controls = control_rows(scene, controls)
             self.rows = len(self.controls)
-        if isinstance(controls, LinearPolicy):
-            self.rows = _intervals(controls, duration)
-        elif isinstance(controls, FirstOrderHold):
-            self.rows = len(controls.u) - 1
         self.most = _MOST_WORK / len(q0)
         self.steps = self.evaluations = 0
         self.errors: dict[tuple[str, int], Floats] = {}
@@ -319,13 +316,6 @@ class _Search:
             return controls
         return held_in_parts(self.scene, controls, *start, span, parts)
 
-    def commands(self, integrator: Integrator, steps: int) -> Commands:
-        """The same as commands of the core."""
-        controls = self.given(steps)
-        if isinstance(controls, np.ndarray):
-            return open_loop(controls)
-        return commands_of(self.scene, integrator, controls, steps, self.duration / steps)
-
     def attempt(self, integrator: Integrator, steps: int) -> Trial:
         """A motion with its error and work; a VarpinError if a user's function has failed in all of many trials."""
         if steps > self.most:
@@ -333,7 +323,7 @@ class _Search:
             self.evaluations += steps
             return Trial(integrator, steps, math.inf, math.inf)
         dt, controls = self.duration / steps, self.given(steps)
-        commands = self.commands(integrator, steps)
+        commands = commands_of(self.scene, integrator, controls, steps, dt)
         try:
             motion, failure = Motions(self.scene, integrator, self.q0, self.v0, dt).under(commands)
             work = motion.statistics.jets.sum() + motion.statistics.sweeps.sum()
@@ -371,9 +361,7 @@ def steps_for_tolerance(
     wanted: Controls | ControlLaw,
     integrator: Integrator | None,
 ) -> Chosen:
-    """Integrator, number of steps and controls for a tolerance [rad or m], with the accuracy, the error and warnings.
-
-    ``wanted`` are the controls, ``integrator`` is the only one to consider, None for all.
+    """What meets a tolerance [rad or m] under the controls ``wanted``, by one ``integrator`` or any.
 
     Raises:
         InputError: The scene, the controls or the integrator are none that a tolerance can choose steps for.
@@ -403,7 +391,7 @@ def steps_for_tolerance(
     ladder = Ladder(search.attempt, members, coarse, search.rows, lambda: search.evaluations > search.most)
     try:
         found = ladder.for_tolerance(max(wish, floor))[0][0]
-    except (StepError, CustomForceError, CustomConstraintError):
+    except (StepError, InputError):
         raise
     except VarpinError:
         raise ToleranceError(wish, duration, coarse, math.inf) from None
@@ -420,18 +408,3 @@ def steps_for_tolerance(
     told = () if record.met else (Finding("tolerance not met", text, value=record.error, unit="rad or m"),)
     error = search.errors[str(found.integrator), found.steps]
     return Chosen(found.integrator, found.steps, search.given(found.steps), record, told, error)
-
-
-def _intervals(policy: LinearPolicy, duration: float) -> int:
-    """The number of a policy's intervals over a motion whose steps a tolerance chooses."""
-    if policy.linear:
-        raise InputError("tolerance chooses dt, and a policy whose controls are linear between nodes takes it: dt=")
-    if policy.period is None:
-        raise InputError("tolerance chooses dt, so a LinearPolicy needs the period of its intervals, period= [s]")
-    parts = len(policy.gains)
-    if abs(parts * policy.period - duration) > 1e-9 * duration:
-        raise InputError(
-            f"the policy has {parts} intervals of {policy.period:g} s, {parts * policy.period:g} s in all, and "
-            f"duration = {duration:g} s"
-        )
-    return parts

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.core import ForwardDynamics
-from varpin.integrators import ExplicitEuler, Integrator
+from varpin.integrators import Integrator
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.simulation.spectrum import largest_of_its_kind, masses
@@ -72,7 +72,7 @@ def before_step(integrator: Integrator) -> float | None:
     """The part of the noise's kicks that comes before an integrator's steps; None where it is held over them."""
     if integrator.holds_noise:
         return None
-    return 0.0 if isinstance(integrator, ExplicitEuler) else integrator.left
+    return 0.0 if integrator.kicks_after else integrator.left
 
 
 def nodes_of(steps: int, stride: int) -> NDArray[np.int64]:

@@ -6,7 +6,7 @@ import inspect
 import math
 import os
 import reprlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from numbers import Real
 from pathlib import Path
@@ -60,7 +60,7 @@ def tuple_of(name: str, given: Any, kind: type, note: str = "") -> tuple[Any, ..
     """
     found = (given,) if isinstance(given, kind) and kind is not str else given
     wanted = f"{name} must be a list" if kind is str else f"{name} must be a list of varpin's {name}"
-    if isinstance(found, str) or not isinstance(found, Iterable):
+    if isinstance(found, str) or not np.iterable(found):
         raise InputError(f"{wanted}, got {reprlib.repr(given)}{note}")
     items = tuple(found)
     for item in items:
@@ -115,8 +115,8 @@ def control_array(
     """``value``, by the names of the driven joints, as a new float array (m,); ``absent`` for those not named."""
     if joints is None:
         raise InputError(
-            f"{name} is given by joint name, but not every control is the force of one joint under this actuation: "
-            "give numbers in the order of the controls"
+            f"{name} is given by joint name, but the joint that each control drives is not known: give numbers in the "
+            "order of the controls"
         )
     return joint_array(name, value, joints, absent=absent, lack="no control is the force of a joint")
 
@@ -138,7 +138,7 @@ def named_limits(
 ) -> Floats:
     """(lower, upper), each one number, (size,) or by the names of ``joints``, as (2, size); infinite for no limit."""
     pair: Any = (-np.inf, np.inf) if limits is None else limits
-    if not isinstance(pair, tuple | list | np.ndarray) or len(pair) != 2:
+    if not (isinstance(pair, tuple | list | np.ndarray) and np.iterable(pair)) or len(pair) != 2:
         both_sides = f"; for +-{limits:g} write (-{limits:g}, {limits:g})" if isinstance(limits, int | float) else ""
         raise InputError(f"{name} must be a pair (lower, upper), got {limits!r}{both_sides}")
     both = np.empty((2, size))

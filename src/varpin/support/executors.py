@@ -29,20 +29,13 @@ def executing(executor: Executor | None, workers: int | None) -> Iterator[Execut
         threads = count("workers", (os.cpu_count() or 1) if workers is None else workers, least=1)
         with ThreadPoolExecutor(threads) as pool:
             yield pool
-        return
-    if workers is not None:
+    elif workers is not None:
         raise InputError("give workers, a number of threads, or executor, which has workers of its own; not both")
-    yield require_executor(executor)
-
-
-def require_executor(executor: object) -> Executor:
-    """``executor`` itself; raises an InputError with its type if it is not an Executor."""
-    if not isinstance(executor, Executor):
-        raise InputError(
-            "executor must be a concurrent.futures.Executor, for example a ProcessPoolExecutor or Dask's "
-            f"client.get_executor(), got {type(executor).__name__}"
-        )
-    return executor
+    elif not isinstance(executor, Executor):
+        wanted = "a concurrent.futures.Executor, for example a ProcessPoolExecutor or Dask's client.get_executor()"
+        raise InputError(f"executor must be {wanted}, got {type(executor).__name__}")
+    else:
+        yield executor
 
 
 def in_order(
@@ -63,10 +56,13 @@ def in_order(
                 return
             try:
                 result = waiting[0].result()
-            except (pickle.PicklingError, AttributeError, TypeError):
-                if not isinstance(executor, ThreadPoolExecutor):
-                    _require_sendable(function, task)
-                raise
+            except (pickle.PicklingError, AttributeError, TypeError) as error:
+                if isinstance(executor, ThreadPoolExecutor) or not _unsendable(function, task):
+                    raise
+                raise InputError(
+                    f"the tasks cannot be sent to the workers ({error!s:.80}): functions must be importable there, "
+                    "defined at the top of a module"
+                ) from error
             waiting.popleft()
             yield result
     except BrokenExecutor as error:
@@ -76,15 +72,13 @@ def in_order(
             future.cancel()
 
 
-def _require_sendable(function: Callable[[Task], Result], task: Task) -> None:
-    """Refuse what cannot be pickled."""
+def _unsendable(*parts: object) -> bool:
+    """Whether something cannot be pickled."""
     try:
-        pickle.dumps((function, task))
-    except Exception as error:
-        raise InputError(
-            f"the tasks cannot be sent to the workers ({error!s:.80}): functions must be importable there, defined at "
-            "the top of a module"
-        ) from error
+        pickle.dumps(parts)
+    except Exception:
+        return True
+    return False
 
 
 def take_all(results: Iterable[Result], take: Callable[[Result], None], tell: Callable[[], None]) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import inspect
 import re
 import reprlib
 import tomllib
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -71,6 +72,16 @@ class Where:
         places = sorted((place.start(), key) for key, place in found.items() if place)
         return (self.at(places[0][1]) if places else self).error(str(error))
 
+    @contextlib.contextmanager
+    def named(self, given: Mapping[str, Any] | None = None) -> Iterator[None]:
+        """A block whose errors are mistakes here, or :meth:`of` the keys ``given`` of this table."""
+        try:
+            yield
+        except SceneFileError:
+            raise
+        except VarpinError as error:
+            raise self.of(error, given or {}) from None
+
     def table(self, given: Any, keys: Collection[str] | None = None, required: Iterable[str] = ()) -> dict[str, Any]:
         """A table with no other keys than these, if there are any."""
         if not isinstance(given, dict):
@@ -94,10 +105,8 @@ class Where:
         arguments = inspect.signature(make).parameters
         keys = [name for name in arguments if name not in {*others, *without}]
         self.table(given, keys, [name for name in keys if arguments[name].default is inspect.Parameter.empty])
-        try:
+        with self.named(given):
             return make(**given, **others)
-        except VarpinError as error:
-            raise self.of(error, given) from None
 
     def kind(self, given: Any, kinds: Mapping[str, _T], default: str = "") -> tuple[str, _T, dict[str, Any]]:
         """The word of a table's key ``type``, its kind, and the other keys."""
@@ -113,10 +122,8 @@ class Where:
 
     def check(self, check: Callable[..., _T], given: Any, *options: Any) -> _T:
         """A value here by one of the checks of arguments."""
-        try:
+        with self.named():
             return check("it", given, *options)
-        except InputError as error:
-            raise self.error(str(error)) from None
 
     def text(self, given: Any) -> str:
         """A text."""
@@ -152,10 +159,8 @@ class Where:
     def positions(self, given: Any, robot: Robot) -> Floats:
         """Positions of the joints (n,) [rad or m]: a posture of the robot by its name, or as :meth:`numbers`."""
         if isinstance(given, str):
-            try:
+            with self.named():
                 return robot.posture(given)
-            except InputError as error:
-                raise self.error(str(error)) from None
         found = self.numbers(given, robot.joint_names)
         self.refuse_degrees(found, robot.joint_names, robot.slides.tolist())
         return found

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from varpin.arrays import Floats, Mask
 from varpin.control.constraints import PlanConstraint
 from varpin.control.costs import Cost, CostSum, Terminal
-from varpin.errors import InputError, RobotNotFound, VarpinError
+from varpin.errors import RobotNotFound, VarpinError
 from varpin.io.scenefile import kinds
 from varpin.io.scenefile.reading import SceneFileError, Where
 from varpin.io.scenefile.references import Timeline, constant, timeline
@@ -23,7 +23,7 @@ from varpin.mechanics.reduction import Required, driving, idle_joints, report
 from varpin.mechanics.scene import Scene, closest_controls, joints_with
 from varpin.model import Robot, combine, load_robot
 from varpin.model.clearance import Obstacle
-from varpin.model.payload import Payload
+from varpin.model.inertia import Payload
 from varpin.model.tree import frame_index
 from varpin.simulation.start import on_constraints, time_steps
 from varpin.support.checks import count
@@ -82,10 +82,8 @@ class Term:
             own[kinds.target_key(self.kind)] = value(0.0) if target.constant else value
         if self.names is None or limits is not None:
             own["robot"] = robot
-        try:
+        with self.where.named({**self.options, "weight": 0.0, "target": 0.0}):
             cost = kinds.COSTS[self.kind](**own)
-        except VarpinError as error:
-            raise self.where.of(error, {**self.options, "weight": 0.0, "target": 0.0}) from None
         return Terminal(cost) if self.terminal else cost
 
 
@@ -119,10 +117,8 @@ class Task:
     def require_start(self) -> None:
         """Refuse a start off the constraints."""
         if self.scene.constraints:
-            try:
+            with self.where.at("initial", "q").named():
                 on_constraints(self.scene, self.q0, self.v0)
-            except VarpinError as error:
-                raise self.where.at("initial", "q").error(str(error)) from None
 
     def without(self, joints: Sequence[str]) -> Task:
         """The same task with ``joints`` held at their initial positions, and without what acts on them alone."""
@@ -200,7 +196,7 @@ def _obstacle(where: Where, given: Any) -> Obstacle:
 
 def joints_of_frame(robot: Robot, frame: str) -> Mask:
     """Whether each coordinate (n,) moves a frame."""
-    model, moving = robot.free_model, np.zeros(robot.dof, dtype=np.bool_)
+    model, moving = robot.model, np.zeros(robot.dof, dtype=np.bool_)
     for joint in model.supports[model.frames[frame_index(model, frame, robot.name)].parentJoint]:
         if joint > 0:
             moving[robot.tree.coordinate[joint - 1]] = True
@@ -265,11 +261,9 @@ def task_of(root: Where, tables: dict[str, Any]) -> Task:
     costs = len(root.at("cost").tables(tables.get("cost", [])))
     if ("steps" in horizon) == ("duration" in horizon):
         raise at.error("a horizon has steps, or a duration [s]: give one of them")
-    try:
+    with at.named(horizon):
         dt, steps = time_steps(horizon["dt"], horizon.get("steps"), horizon.get("duration"))
         count("steps", steps, 1)
-    except InputError as error:
-        raise at.of(error, horizon) from None
     if steps * max(1, _PER_COST * costs) > _MOST_STEPS:
         raise at.error(f"{steps} steps are more than {_MOST_STEPS}, or a tenth of that divided by the number of costs")
     return _on_robot(root, tables, _robot(root.at("robot"), tables["robot"]), dt, steps)
@@ -282,10 +276,8 @@ def _robot(where: Where, given: Any) -> Robot:
     members = [(place, dict(place.table(own))) for place, own in where.tables(given)]
     prefixes = [place.at("prefix").text(own.pop("prefix")) if "prefix" in own else "" for place, own in members]
     robots = [_one(place, own) for place, own in members]
-    try:
+    with where.named():
         return combine(*robots, prefixes=prefixes)
-    except InputError as error:
-        raise where.error(str(error)) from None
 
 
 def _one(where: Where, given: Any) -> Robot:
@@ -402,10 +394,8 @@ def _bound(where: Where, kind: Any, own: dict[str, Any], robot: Robot) -> Any:
         if isinstance(value, dict) and value.keys() == {"frame", "place"}
     }
     made = where.call(kind, own | points)
-    try:
+    with where.named(own | points):
         description_constraints(robot) if made == "robot" else made.bind(robot)
-    except VarpinError as error:
-        raise where.of(error, own | points) from None
     return made
 
 
@@ -452,8 +442,8 @@ def _term(where: Where, table: Any, task: Task, horizon: tuple[float, float]) ->
     if kind in kinds.OF_JOINTS + kinds.OF_CONTROLS:
         names = task.driven if kind in kinds.OF_CONTROLS else robot.joint_names
     what = "joint" if names is not None else "component"
-    if "frame" in own and not robot.free_model.existFrame(own["frame"]):
-        where.at("frame").one_of(own["frame"], [frame.name for frame in robot.free_model.frames])
+    if "frame" in own and not robot.model.existFrame(own["frame"]):
+        where.at("frame").one_of(own["frame"], [frame.name for frame in robot.model.frames])
     axes = names if names is not None else kinds.AXES.get(kind, ("weight",))
     weight = where.at("weight").numbers(own.pop("weight", 1.0), axes, what)
     hold, terminal, given = own.pop("hold", None), own.pop("terminal", False), own.pop(target_key, None)

@@ -283,7 +283,7 @@ def _task(given: object, source: object, robot: Robot) -> tuple[Scene | None, tu
 
 def _frame(figure: Figure, name: str) -> Mark:
     """The axes of a frame of the robot."""
-    body, rotation, place = place_of_frame(figure.robot.free_model, name, figure.robot.name)
+    body, rotation, place = place_of_frame(figure.robot.model, name, figure.robot.name)
     pose = translation(place)
     pose[:3, :3] = rotation
     tips = place + _TRIAD * figure.size * rotation.T

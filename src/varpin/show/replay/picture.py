@@ -30,7 +30,7 @@ class Picture:
     """
 
     robot: Robot
-    shapes: Sequence[pin.GeometryObject]  # its visual geometry, or a skeleton; on joints of ``robot.free_model``
+    shapes: Sequence[pin.GeometryObject]  # its visual geometry, or a skeleton; on joints of ``robot.model``
     meshes: Sequence[tuple[MeshPart, ...]]  # parts of the mesh of each shape; none for a shape of another kind
     bodies: Sequence[int]  # body of each shape, -1 for the base
     placements: Sequence[pin.SE3]  # placement of each shape in its body's frame
@@ -62,7 +62,7 @@ class Picture:
 
     def moving_nodes(self, root: str) -> list[str]:
         """Scene path below ``root`` of each body (b,)."""
-        names = labels(self.robot.free_model.names[1:])
+        names = labels(self.robot.model.names[1:])
         nodes: list[str] = []
         for name, parent in zip(names, self.robot.tree.parent, strict=True):
             nodes.append(f"{nodes[parent] if parent >= 0 else root}/{name}/moving")
@@ -100,7 +100,7 @@ def corners_of(box: Floats) -> Floats:
 
 def _turns(robot: Robot) -> list[pin.SE3]:
     """Rotations from the model's joint frames, the universe first, to those of the bodies, whose joint axis is z."""
-    model = robot.free_model
+    model = robot.model
     axes = [joint_axis(model, joint)[1] for joint in range(1, model.njoints)]
     return [pin.SE3.Identity(), *(pin.SE3(z_to(axis).T, np.zeros(3)) for axis in axes)]
 
@@ -127,7 +127,7 @@ def labels(names: Iterable[str]) -> list[str]:
 
 def _skeleton(robot: Robot) -> list[pin.GeometryObject]:
     """Spheres at joints and centres of mass, and rods from each joint to its children, frames and centre of mass."""
-    model = robot.free_model
+    model = robot.model
     joints = range(1, model.njoints)
     ends: dict[int, list[Floats]] = {joint: [] for joint in range(model.njoints)}
     for joint in joints:
