@@ -196,5 +196,5 @@ class TestTheCoreGetsWhatFits:
     )
     def test_trajectories_changed_by_hand(self, name, value):
         motion = vp.simulate(SCENE, [0.1, 0.2], [0.0, 0.0], dt=1e-3, steps=5)
-        with pytest.raises(ValueError, match=r"shape|size|negative"):
+        with pytest.raises(ValueError, match="must be a float64 array"):
             vp.linearize(SCENE, dataclasses.replace(motion, **{name: value}))

@@ -78,10 +78,10 @@ class TestFiles:
         ("content", "facts"),
         [
             (b"hello world\n", ("XML", "line 1")),
-            (b"", ("XML", "no element found")),
+            (b"", "empty"),
             (b"<!DOCTYPE html>\n<html><head><meta charset=utf8></head></html>", "XML"),
-            (b"<sdf/>", ("not a URDF", "'robot' element")),
-            (b"<mujoco><worldbody/></mujoco>", ("not a URDF", "'robot' element")),
+            (b"<sdf/>", ("not a URDF", "<sdf>")),
+            (b"<mujoco><worldbody/></mujoco>", ("not a URDF", "<mujoco>")),
             (b"<robot name='a'>\n<link name='x'>\n</robot>", ("XML", "line 3")),
             (b"<robot name='a'>\n<link name='x'/>\n", ("XML", "line 3")),
             (b"<robot name='a'>\0\0</robot>", "XML"),

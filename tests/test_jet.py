@@ -100,7 +100,7 @@ class TestPrecision:
                 far.jointPlacements[joint] = pin.SE3(placement.rotation, placement.translation + by)
         return far
 
-    @pytest.mark.parametrize("name", ["ur5", "panda", "allegro_left_hand"])
+    @pytest.mark.parametrize("name", ["ur5", "xarm7", "allegro_left_hand"])
     def test_of_a_base_ten_kilometres_away(self, load, name):
         near = load(name)
         far = vp.load_robot(self.moved(near.model, np.array([1e4, -1e4, 3e3])))
