@@ -135,7 +135,7 @@ def test_any_damaged_byte_is_an_error_or_harmless(name, tmp_path):
 
 
 # The last part of the names of entries that may be missing.
-OPTIONAL = {"version", "warnings", "missing", "fingerprint", "accuracy", "motion"}
+OPTIONAL = {"version", "warnings", "missing", "fingerprint", "accuracy", "motion", "constraint_labels"}
 
 
 @pytest.mark.parametrize("name", LOADERS)

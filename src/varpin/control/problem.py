@@ -386,8 +386,8 @@ class OptimalControlProblem(Frozen):
         """The first difference from a problem of another :attr:`setting` in words; empty if there is none."""
         for name in dict.fromkeys((*self.setting, *setting)):
             theirs, mine = (np.asarray(one.get(name, np.zeros(0))) for one in (setting, self.setting))
-            texts = "U" in (mine.dtype.kind, theirs.dtype.kind)
-            if not (np.array_equal(theirs, mine) if texts else same(theirs, mine)):
+            numbers = {mine.dtype.kind, theirs.dtype.kind} <= set("bif")
+            if not (same(theirs, mine) if numbers else np.array_equal(theirs, mine)):
                 single = mine.ndim == theirs.ndim == 0
                 return f"{name} = {theirs}, not {mine}" if single else f"different {name.replace('.', ' ')}"
         return ""
