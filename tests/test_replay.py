@@ -153,6 +153,7 @@ def test_size_stays_sane_for_a_long_motion(finger, tmp_path):
     q = np.column_stack([np.sin(t), 1.0 + np.cos(0.7 * t), 0.5 + 0.5 * np.sin(1.3 * t)])
     path = replay(finger, q, dt=1e-3, html=tmp_path / "long.html")
     assert path.stat().st_size < 2_000_000
+    assert "<li>drawn every 0.1 s, straight in between</li>" in path.read_text(encoding="utf-8")
     tracks, _ = animation(path)
     for (times, values), column in zip(tracks.values(), q.T, strict=True):
         assert len(times) == 10_000

@@ -57,7 +57,7 @@ class Stage:
     toward: Floats  # unit vector (3,) to the camera
     size: float  # size of the largest robot's motion [m]
     speed: float  # seconds of motion in a second of playback
-    error: str  # the estimated error of the motions in words; empty where it is not known
+    error: str  # how far the picture may be off in words, for the legend; empty where nothing is known
 
     @classmethod
     def of(cls, times: Floats, actors: Sequence[Actor], speed: float = 1.0, error: str = "") -> Stage:

@@ -226,11 +226,13 @@ def _stage(shown: Sequence[_Shown], fps: float, speed: float) -> Stage:
     ]
     motions = [motion_of(one.given) for one in shown]
     errors = [path.error_text for path in motions if isinstance(path, Trajectory) and path.error_text]
+    notes = [f"estimated {'; '.join(errors)} rad or m"] if errors else []
+    notes += [f"drawn every {times[1]:.2g} s, straight in between"] if len(times) == MOST_FRAMES else []
     return Stage.of(
         times / speed,
         [one.actor(times, *names) for one, names in zip(shown, frames, strict=True)],
         speed,
-        f"estimated {'; '.join(errors)} rad or m" if errors else "",
+        "; ".join(notes),
     )
 
 
