@@ -36,9 +36,9 @@ from varpin.show.replay.marks import (
     Mark,
     references,
     require_marks,
+    rod,
     rows_at,
     surroundings,
-    ties,
     translation,
 )
 from varpin.show.replay.page import open_browser
@@ -268,9 +268,8 @@ class LiveView:
         self._q = row[0]
         figure = replace(self._stage.figures[0], q=row)
         for k, mark in enumerate(self._stage.marks[0]):
-            for item in [] if mark.tied is None else next(ties(figure, mark.tied)).items:
-                if item.node == "rod":
-                    self._viewer[mark_node(figure.picture, mark_name(k, mark), "rod")].set_transform(item.pose)
+            for item in [] if mark.tied is None else rod(figure, mark.tied):
+                self._viewer[mark_node(figure.picture, mark_name(k, mark), item.node)].set_transform(item.pose)
         self._keep_in_view(figure.poses[1][0])
 
     def _keep_in_view(self, points: Floats) -> None:

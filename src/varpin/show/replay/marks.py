@@ -75,7 +75,7 @@ class Mark:
     name: str
     around: Floats  # points around it (P, 3) [m]
     items: Sequence[Item]
-    tied: Constraint | None = None  # the constraint that it shows; its rod moves with the robot
+    tied: Constraint | None = None  # the constraint between two points whose rod moves with the robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,11 +301,11 @@ def ties(figure: Figure, constraint: Constraint) -> Iterator[Mark]:
     (here, _, a), (there, turned, b) = (point_of(end, getattr(constraint, end), figure.robot) for end in "ab")
     axis = getattr(constraint, "normal", getattr(constraint, "direction", None))
     items = [Item("a", shapes.joint_ball(_POINT * size, color), translation(a), here)]
-    seen = _in_world(figure, here, a)
     if axis is None:
         items.append(Item("b", shapes.joint_ball(_POINT * size, color), translation(b), there))
-        items += _rod(figure, seen, _in_world(figure, there, b))
+        items += rod(figure, constraint)
     else:
+        seen = _in_world(figure, here, a)
         axes = z_to(turned @ np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis))
         if there >= 0:
             R, p = figure.poses
@@ -322,11 +322,13 @@ def ties(figure: Figure, constraint: Constraint) -> Iterator[Mark]:
             line = shapes.tube(b + np.outer(ends, axes[:, 2]), TUBE * size, color)
             items.append(Item("line", line, body=there))
     fixed = np.array([place for body, place in ((here, a), (there, b)) if body < 0]).reshape(-1, 3)
-    yield Mark("constraint", name, fixed, items, constraint)
+    yield Mark("constraint", name, fixed, items, constraint if axis is None else None)
 
 
-def _rod(figure: Figure, a: Floats, b: Floats) -> Iterator[Item]:
-    """A rod between two points at the keyframes (K, 3) [m]; none if they always coincide."""
+def rod(figure: Figure, constraint: Constraint) -> Iterator[Item]:
+    """The rod between the two points of a constraint; none if they always coincide."""
+    ends = (point_of(end, getattr(constraint, end), figure.robot) for end in "ab")
+    a, b = (_in_world(figure, body, place) for body, _, place in ends)
     lengths = np.linalg.norm(b - a, axis=1)
     if lengths.max() < TUBE * figure.size:
         return
