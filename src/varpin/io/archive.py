@@ -192,11 +192,11 @@ class _Reader:
         """The value of type ``hint`` at a name, or of the entries below it."""
         origin: Any = typing.get_origin(hint)
         kinds: tuple[Any, ...] = typing.get_args(hint)
-        below = {own.removeprefix(f"{name}."): own for own in self.members if own.startswith(f"{name}.")}
         if is_dataclass(hint):
             return self.record(hint, f"{name}.")
         if origin is Mapping:
-            return {key: self.array(kinds[1], own) for key, own in below.items()}
+            below = [own for own in self.members if own.startswith(f"{name}.")]
+            return {own.removeprefix(f"{name}."): self.array(kinds[1], own) for own in below}
         if origin in (Annotated, np.ndarray):
             return self.array(hint, name)
         if origin is not tuple:
