@@ -291,8 +291,12 @@ def path_like(name: str, path: Any) -> Path:
 def writable(path: str | os.PathLike[str]) -> Path:
     """``path`` with links resolved, checked before any work is done for the file."""
     target = path_like("path", path).resolve()
+    exists = True
+    # Not target.exists(), which from Python 3.14 on has no error for a name that is too long.
     try:
-        exists = target.exists()
+        target.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        exists = False
     except OSError as error:
         raise FileError(f"cannot write a file of that name, {target.name[:40]!r}: {error.strerror}") from None
     if exists and not target.is_file():
