@@ -103,6 +103,7 @@ MISTAKES = [
     ("simulate ARM --q0 elbow=1 2", ("--q0", "JOINT=VALUE")),
     ("simulate ARM --v0 elbow=1 elbow=2", ("--v0", "once", "elbow=2")),
     ("simulate ARM --v0 elbow=a", ("--v0", "elbow=a", "JOINT=VALUE")),
+    ("simulate ARM --q0 =1", ("--q0", "=1", "JOINT=VALUE")),
     ("simulate ARM --lock elbow", ("--lock", "elbow", "JOINT=VALUE")),
     ("simulate ARM --save a.txt", ("--save", ".npz", "'a.txt'")),
     ("simulate nobody.urdf", "'nobody.urdf'"),

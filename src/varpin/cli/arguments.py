@@ -103,15 +103,15 @@ def values_of(option: str, words: Sequence[str] | None) -> JointValues | str | N
     if len(words) == 1 and "=" not in words[0] and words[0].strip()[:1].isalpha():
         return words[0].strip()
     pairs = [word.strip().rpartition("=") for word in words]
-    names = {name for name, *_ in pairs}
+    names = {name if equals else None for name, equals, _ in pairs}
     try:
         numbers = [float(number) for *_, number in pairs]
-        if names != {""} and ("" in names or len(names) < len(numbers)):
+        if names != {None} and (names & {None, ""} or len(names) < len(numbers)):
             raise ValueError
     except ValueError:
         allowed = "numbers, JOINT=VALUE once for each of some joints, or one word"
         raise InputError(f"--{option} takes {allowed}; got {' '.join(words)}") from None
-    if names != {""}:
+    if names != {None}:
         return {name: number for (name, *_), number in zip(pairs, numbers, strict=True)}
     return numbers[0] if len(numbers) == 1 else numbers
 
