@@ -242,6 +242,17 @@ def test_output_that_fails_after_the_run_leaves_the_others(arm, tmp_path, capsys
     assert "a.npz" not in out
 
 
+def test_a_solution_that_was_not_saved_is_not_continued_from(scene, capsys, monkeypatch):
+    def full(self, path):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(vp.Solution, "save", full)
+    assert main(["solve", scene, "--max-iterations", "1", "--save", "part.npz"]) == console.STEP_FAILED
+    err = capsys.readouterr().err
+    assert not unnamed(err, "No space left on device", "not converged", "--save NPZ")
+    assert "--resume" not in err
+
+
 def test_failed_step_keeps_what_was_before_it(arm, tmp_path, capsys, monkeypatch):
     whole = vp.simulate
 

@@ -169,7 +169,9 @@ def _solve(request: argparse.Namespace, errors: Console) -> int:
         written, trouble = write_all(request, errors, outputs, file.robot, solution.trajectory, solution)
     converged, refinement = solution.status.converged, solution.refinement
     unmet = refinement is not None and not refinement.met
-    told = _status(solution, request.scene, request.save)
+    # The solution is the first of the outputs.
+    kept = request.save is not None and ("written", next(iter(outputs))) in written
+    told = _status(solution, request.scene, request.save if kept else None)
     if not request.quiet:
         # The last two lines are the status, which the next table has, and its reason.
         show("\n".join(solution.table().splitlines()[:-2]))
@@ -180,11 +182,11 @@ def _solve(request: argparse.Namespace, errors: Console) -> int:
         say(errors, refinement.reason, style="yellow")
     if solution.status is Status.INTERRUPTED:
         return INTERRUPTED
-    return trouble or (0 if converged and not unmet else STEP_FAILED)
+    return (0 if converged and not unmet else STEP_FAILED) or trouble
 
 
 def _status(solution: Solution, scene: str, saved: Path | None) -> str:
-    """How the search ended, with advice for the command line."""
+    """How the search ended, with advice for the command line; ``saved`` is the file that has the solution."""
     if solution.status is Status.MAX_ITERATIONS:
         advice = "with --save NPZ this solution can be continued from"
         if saved is not None:
