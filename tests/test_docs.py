@@ -176,6 +176,19 @@ def test_an_equation_is_computed_where_the_map_says(numbers, functions):
 
 
 HEADERS = sorted((ROOT / "src" / "core").rglob("*.hpp"))
+NAMED_PAGE = re.compile(r"docs/([\w-]+\.md)((?:(?:,| and)? \"[^\"]+\")*)")
+
+
+@pytest.mark.parametrize("header", HEADERS, ids=lambda path: path.name)
+def test_a_header_names_a_page_at_its_head(header):
+    """And sections of it that there are: headings, or words in bold at the beginning of a paragraph."""
+    head = header.read_text(encoding="utf-8").partition("#pragma once")[0]
+    named = NAMED_PAGE.findall(re.sub(r"\s*\n// *", " ", head))
+    assert named, f"{header.name} names no page of docs/"
+    for page, sections in named:
+        assert page in PAGES
+        for section in re.findall(r'"([^"]+)"', sections):
+            assert re.search(rf"^(?:#+ |\*\*){section}\b", text_of(page), re.M), f"{page} has no section {section!r}"
 
 
 def test_every_header_of_the_core_is_on_its_map():
