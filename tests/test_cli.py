@@ -17,6 +17,7 @@ from refusals import naming, unnamed
 from rich.console import Console
 
 import varpin as vp
+import varpin_command
 from varpin.cli import console, main
 from varpin.model import load_robot
 
@@ -491,3 +492,53 @@ def test_a_plan_that_cannot_be_is_told_with_its_constraint(scene, tmp_path, caps
     err = capsys.readouterr().err
     assert "infeasible: ReachFrame" in err
     assert "plan.reason" not in err
+
+
+def test_split_steps_are_flagged_in_the_table(arm, capsys):
+    assert main(["simulate", arm, "--integrator", "midpoint", "--dt", "0.3", "--steps", "20", "--v0", "5", "0"]) == 0
+    out, err = capsys.readouterr()
+    assert re.search(
+        r"split steps \d+ of 20, into up to \d+ parts: a smaller dt keeps the structure", " ".join(out.split())
+    )
+    assert re.search(r"^varpin: warning: q is off by up to \S+ rad, .* Use integrator=", err, re.MULTILINE)
+
+
+def test_lack_of_memory_is_no_traceback(arm, capsys, monkeypatch):
+    def exhausted(*_, **__):
+        raise MemoryError("Unable to allocate 7 TiB")
+
+    monkeypatch.setattr("varpin.cli.runs.simulate", exhausted)
+    assert main(["simulate", arm]) == 2
+    assert not unnamed(error_of(capsys), "varpin: error", "Unable to allocate 7 TiB")
+
+
+def test_inspect_takes_what_simulate_refuses(tmp_path, capsys):
+    path = tmp_path / "empty.urdf"
+    path.write_text(
+        '<robot name="empty"><link name="base"/><link name="ghost"/><joint name="hinge" type="continuous">'
+        '<parent link="base"/><child link="ghost"/><axis xyz="0 0 1"/></joint></robot>'
+    )
+    assert main(["simulate", str(path)]) == 2
+    assert not unnamed(error_of(capsys), "'hinge'")
+    assert main(["inspect", str(path)]) == 0
+    out = capsys.readouterr().out
+    assert not unnamed(out, "singular")
+    assert naming(out.splitlines(), "warning", "'ghost'", "'hinge'")
+
+
+def test_installed_command_leaves_ctrl_c_to_the_command_line(monkeypatch):
+    """What a run does at Ctrl-C is its own matter again once everything is imported."""
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr("varpin.cli.main", lambda: int(signal.getsignal(signal.SIGINT) is before))
+    assert varpin_command.main() == 1
+
+
+@pytest.mark.parametrize(("words", "speed"), [([], 0.5), (["--speed", "1"], 1.0), (["--speed", "0.25"], 0.25)])
+def test_speed_of_a_scene_s_replay(tmp_path, monkeypatch, words, speed):
+    """The file's own, 0.5, unless one is asked for."""
+    asked = []
+    monkeypatch.setattr(
+        "varpin.show.replay.motion.replay", lambda *_, speed, html, **__: asked.append(speed) or html.touch()
+    )
+    assert main(["simulate", "ur5_reach", "--html", str(tmp_path / "a.html"), "--quiet", *words]) == 0
+    assert asked == [speed]
