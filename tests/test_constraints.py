@@ -497,3 +497,19 @@ def test_rows_whose_terms_vanish_hold_from_rest():
     fixed = vp.load_robot("ur5")
     alone = vp.simulate(vp.Scene(fixed), np.zeros(6), np.zeros(6), dt=2e-3, steps=20, integrator=vp.Gauss(2))
     np.testing.assert_allclose(motion.q[:, 3:], alone.q, atol=1e-9)
+
+
+def test_a_start_far_from_the_constraints_is_refused():
+    scene, q, _ = loop("five-bar")
+    with refused(vp.InputError, "q0", "PointOnPoint", "assemble"):
+        vp.simulate(scene, q + 0.1, 0.0 * q, dt=1e-2, steps=2)
+
+
+def test_what_cannot_be_assembled_says_by_how_much():
+    robot = vp.planar_chain(2)
+    scene = vp.Scene(
+        robot, constraints=[vp.JointTie("joint2", "joint1"), vp.PointOnPoint("tip", (2.5, 0.0, 0.0), axes="xz")]
+    )
+    with refused(vp.AssemblyError, "PointOnPoint") as found:
+        vp.assemble(scene, [1.4, 0.4])
+    assert found.value.miss > 0.3

@@ -335,3 +335,35 @@ def test_a_file_gives_the_ensemble_back(store, tmp_path):
         np.savez(path, **dict(members) | {"t": np.zeros(3)})
     with pytest.raises(vp.FileError, match="instead of float64"):
         vp.Ensemble.load(path)
+
+
+def test_each_path_may_have_its_own_start():
+    q0, v0 = np.random.default_rng(0).normal(size=(2, 40, 2))
+    end = run(q0=q0, v0=v0)
+    np.testing.assert_array_equal(end.q[:, 0], q0)
+    np.testing.assert_array_equal(end.v[:, 0], v0)
+    for path, child in enumerate(np.random.default_rng(7).spawn(40)):
+        alone = vp.simulate(make_scene(), q0[path], v0[path], dt=0.01, steps=50, rng=child, controls=[0.3, -0.1])
+        assert end.p[path].tobytes() == alone.p.tobytes()
+
+
+def test_one_path_has_no_covariance():
+    alone = run(paths=1).statistics
+    assert not alone.covariance.any()
+    assert not alone.energy_deviation.any()
+    assert (alone.count == 1).all()
+
+
+@pytest.mark.parametrize(
+    ("shape", "facts"),
+    [
+        ((49, 2, 4), ("49", "1", "50")),
+        ((50, 1, 4), ("gains", "(N, 2, 4)", "(50, 1, 4)")),
+        ((50, 2, 6), ("gains", "(N, 2, 4)", "(50, 2, 6)")),
+    ],
+)
+def test_policies_that_do_not_fit_the_scene(shape, facts):
+    steps, m, size = shape
+    policy = vp.LinearPolicy(np.ones((steps, m)), np.ones(shape), np.ones((steps, size)))
+    with refused(vp.InputError, facts):
+        run(controls=policy)

@@ -245,3 +245,32 @@ def test_many_paths_need_no_more_memory_than_few():
     few, many = peak(4000), peak(40_000)
     # A number or two for each path; paths themselves would take 100 times as much.
     assert many < few + 40_000 * 64
+
+
+def failing(task):
+    if task == 2:
+        raise vp.UnknownJoint("elbow", ("knee",), "a robot")
+    return task
+
+
+def test_what_work_raises_comes_back(spawned):
+    results = in_order(spawned, failing, range(5))
+    assert [next(results), next(results)] == [0, 1]
+    with refused(vp.UnknownJoint, "elbow"):
+        next(results)
+    # The pool is as good as before.
+    assert list(in_order(spawned, abs, [-1, 2])) == [1, 2]
+
+
+def test_interruption_on_processes_keeps_what_is_done(spawned):
+    def interrupt(done, paths):
+        if done > 200:
+            raise KeyboardInterrupt
+
+    with pytest.raises(vp.EnsembleInterrupted) as caught:
+        run(paths=3000, executor=spawned, progress=interrupt)
+    part = caught.value.ensemble
+    done = len(part.q)
+    assert 200 < done < 3000
+    assert part.q.tobytes() == run(paths=done).q.tobytes()
+    assert run(executor=spawned).statistics.count[0] == 40

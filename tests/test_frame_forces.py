@@ -117,3 +117,32 @@ def test_stiffness_about_each_axis():
     added = vp.lagrangian_jet(vp.Scene(robot, damping=0.0), q, 0 * q).Lqq - vp.lagrangian_jet(scene, q, 0 * q).Lqq
     W = a.rotation.T @ (on_a - on_b)
     np.testing.assert_allclose(added, W.T @ (k[:, None] * W), atol=1e-12 * k.max())
+
+
+def test_a_hanging_spring_finds_its_rest():
+    """A slider on a spring with a length: where stiffness and weight are even."""
+    robot = vp.planar_chain(1)
+    load = vp.FrameWrench("joint1", [0, 0, 0, 0, -2.0, 0])
+    scene = vp.Scene(robot, gravity=False, damping=3.0, forces=[vp.JointSpring(4.0), load])
+    motion = vp.simulate(scene, [0.0], [0.0], dt=1e-2, steps=2000)
+    axis = frame_of(robot, "joint1", np.zeros(1))[1][:, 0]
+    np.testing.assert_allclose(motion.q[-1], load.wrench[3:] @ axis / 4.0, atol=1e-6)
+
+
+def test_a_tool_that_a_spring_holds_in_place_and_turned():
+    """Six springs and six dampers at the tool: the arm comes to rest where frame a is as it is to be."""
+    robot, tip = vp.load_robot("ur5"), "tool0"
+    q = np.array([0.3, -1.2, 1.4, -0.4, 0.5, 0.2])
+    goal = frame_of(robot, tip, q)[0]
+    R, x = goal.rotation, goal.translation
+    forces_ = [
+        vp.FrameSpring(tip, x, 2000.0, rotational_stiffness=200.0, rest_rotation=R),
+        vp.FrameDamper(tip, x, 400.0, 40.0),
+    ]
+    scene = vp.Scene(robot, gravity=False, damping=0.0, forces=forces_)
+    start = q + 0.2 * np.array([1.0, -1.0, 1.0, 0.5, -1.0, 1.0])
+    motion = vp.simulate(scene, start, np.zeros(6), dt=5e-3, steps=800, integrator=vp.Radau(2))
+    end, _ = frame_of(robot, tip, motion.q[-1])
+    np.testing.assert_allclose(end.translation, x, atol=1e-4)
+    np.testing.assert_allclose(end.rotation, R, atol=1e-3)
+    assert np.diff(motion.energy).max() <= 1e-9 * motion.energy[0]

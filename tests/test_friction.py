@@ -148,3 +148,21 @@ def test_noise_beyond_the_width_of_friction_is_reported():
     assert told == [True, False]
     paths = calm.monte_carlo(paths=100, rng=0)
     assert paths.cost == pytest.approx(paths.predicted, abs=4.0 * paths.standard_error)
+
+
+def test_an_arm_comes_to_rest():
+    """All joints of an arm under friction that holds it, against SciPy; its energy never rises on the way."""
+    robot = vp.load_robot("ur5")
+    scene = vp.Scene(robot, gravity=False, forces=vp.CoulombFriction([8.0, 8.0, 5.0, 2.0, 2.0, 1.0], 1e-2))
+    begin, speed = np.array([0.0, -1.2, 1.5, -0.5, 0.3, 0.2]), np.array([1.0, 1.0, -1.0, 1.0, 2.0, 2.0])
+
+    def slope(_, x):
+        return np.concatenate([x[6:], accelerations(scene, x[:6], x[6:], np.zeros(6))])
+
+    times = np.linspace(0.0, 0.6, 13)
+    exact = solve_ivp(slope, (0.0, 0.6), np.append(begin, speed), "Radau", t_eval=times, rtol=1e-8, atol=1e-10).y.T
+    for integrator, error in ((vp.Radau(3), 2e-6), (vp.Gauss(3), 2e-6), (vp.Midpoint(), 2e-5)):
+        motion = vp.simulate(scene, begin, speed, dt=1e-3, steps=600, integrator=integrator)
+        np.testing.assert_allclose(motion.q[::50], exact[:, :6], atol=error)
+        assert np.abs(motion.v[-1]).max() < 1e-6
+        assert np.diff(motion.energy).max() <= 1e-12 * motion.energy[0]

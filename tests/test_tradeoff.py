@@ -309,3 +309,40 @@ def test_advice_on_a_random_set(script):
     assert len(verdicts) > 50
     assert np.mean([verdict.met for verdict in verdicts]) >= 0.95
     assert np.mean([verdict.ratio <= 2.0 for verdict in verdicts]) >= 0.8
+
+
+def test_orders_are_visible():
+    scene = vp.Scene(vp.load_robot("ur5"), damping=0.5, stiffness=8.0, rest=0.1)
+    q0, v0 = np.linspace(0.2, 0.6, 6), np.linspace(0.5, -0.5, 6)
+    controls = np.random.default_rng(0).normal(size=(4, 6))
+    counts = {1: (400, 800, 1600), 2: (100, 200, 400), 4: (48, 96, 192)}
+    counts |= {5: (24, 32, 48), 6: (16, 24, 32), 7: (12, 16, 24), 8: (8, 12, 16), 10: (4, 8)}
+    for integrator in INTEGRATORS:
+        steps = counts[integrator.order]
+        record = vp.work_precision(
+            scene,
+            q0,
+            v0,
+            duration=0.25,
+            controls=controls,
+            dts=[0.25 / k for k in steps],
+            integrators=[integrator],
+            repeats=1,
+        )
+        errors = np.array([run.error for run in record.runs])
+        orders = np.log(errors[:-1] / errors[1:]) / np.log(np.divide(steps[1:], steps[:-1]))
+        assert np.abs(orders - integrator.order).max() < 0.05 * integrator.order + 0.1, (integrator, errors, orders)
+        assert not any(record.at_floor(run) for run in record.runs)
+        assert all(np.isnan(run.energy_error) for run in record.runs)
+
+
+def test_steps_that_a_guard_splits_are_not_taken_for_agreement():
+    """Runs of different dt whose steps are all split into the same parts are one motion, right or wrong."""
+    scene = vp.Scene(vp.load_robot("ur5"))
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        q0, v0 = rng.uniform(-1.5, 1.5, 6), rng.uniform(-1, 1, 6)
+        advice = vp.advise(scene, q0, v0, duration=1.0, tolerance=1e-5, integrators=[vp.Midpoint()])
+        exact = vp.simulate(scene, q0, v0, dt=1.0, steps=1, integrator=vp.Reference()).q[-1]
+        motion = vp.simulate(scene, q0, v0, dt=advice.best.dt, steps=advice.best.steps)
+        assert np.abs(motion.q[-1] - exact).max() <= 1e-5

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from findings import about
+from naive import continuous
 from refusals import naming, refused, unnamed
 
 import varpin as vp
@@ -129,3 +130,68 @@ def test_a_loss_within_the_wish_is_no_warning() -> None:
     assert 2e-3 < plan.verify().closed_loop_loss < 1e-2
     assert not naming(plan.warnings, "in quarters of dt")
     assert naming(vp.solve(plan.problem, plan.controls).warnings, "in quarters of dt")
+
+
+@pytest.mark.parametrize("controls", ["held", "linear"])
+def test_the_first_step_within_the_wish_is_taken(controls: str) -> None:
+    problem = reach(3, controls)
+    plan = vp.solve(problem, true_cost=1e-4)
+    found = plan.refinement
+    assert found.met
+    assert found.chosen == len(found.tried) - 1 >= 1
+    assert plan.status.converged
+    assert abs(plan.verify().closed_loop_loss) <= 1e-4
+    assert all(abs(row.loss) > 1e-4 or row.excess > 1e-4 for row in found.tried[:-1])
+    assert found.tried[-1].excess <= 1e-4
+    np.testing.assert_allclose([row.dt for row in found.tried], [1 / 3 / 2**k for k in range(len(found.tried))])
+    assert plan.problem.steps == found.tried[-1].steps == plan.trajectory.steps
+    assert str(found) in plan.table()
+    # Each row is the plan of its step, from whatever controls it began.
+    cold = vp.solve(problem.at(dt=found.tried[-1].dt), check=False)
+    assert plan.cost == pytest.approx(cold.cost, rel=1e-5)
+
+
+def on_robot(plan: vp.Solution) -> tuple[float, np.ndarray]:
+    """The cost of a plan of ``within`` with feedback, and its velocities in eighths of steps, by DOP853."""
+    problem, policy, parts, given = plan.problem, plan.policy_on("velocity"), 8, []
+
+    def running(t: float, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> float:
+        return 1e-2 * (u @ u + v @ v)
+
+    def law(k: int, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+        if k % parts == 0:
+            decision = k // parts
+            state = np.concatenate([q, v]) - policy.reference[decision]
+            given.append(plan.controls[decision] + policy.gains[decision] @ state)
+        return given[-1]
+
+    rows = np.repeat(plan.controls, parts, axis=0)
+    q, v, integral = continuous(
+        problem.scene, problem.q0, problem.v0, rows, problem.dt / parts, running, law, rtol=1e-9
+    )
+    return integral + 100.0 * ((q[-1] - [1.0, 0.5]) ** 2).sum() + 10.0 * v[-1] @ v[-1], v
+
+
+def test_within_constraints():
+    limited = within(vp.WithinVelocityLimits(vp.planar_chain(2), (-4.8, 1.2)))
+    plan = vp.solve(limited, true_cost=0.01, check=False)
+    found = plan.refinement
+    row = found.tried[found.chosen]
+    assert found.met
+    assert plan.problem.steps == row.steps > 12
+    assert plan.status.converged
+    assert plan.violation <= 1e-6
+    # Multipliers and controls of the plan before are near those of half the step.
+    assert all(finer.iterations < found.tried[0].iterations for finer in found.tried[1:])
+    true, v = on_robot(plan)
+    assert row.true_cost == pytest.approx(true, rel=1e-4)
+    assert abs(true / plan.cost - 1.0) <= 0.01
+    # Held controls exceed the limit between nodes: at 0.1 s by a thirtieth of what is allowed to rest.
+    beyond = (v - 1.2).max() / 6.0
+    assert row.violation == pytest.approx(beyond, rel=1e-2)
+    assert 1e-4 < beyond < 1e-3 < found.tried[0].violation
+    fine = vp.solve(limited.at(dt=plan.problem.dt / 2), check=False)
+    assert fine.violation <= 1e-6
+    assert true <= 1.01 * fine.cost
+    with refused(vp.InputError, "resume", "true_cost"):
+        vp.solve(limited, resume=plan, true_cost=0.1)
