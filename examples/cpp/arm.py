@@ -29,6 +29,7 @@ inline varpin::Mechanism arm() {{
     out.tree.group = {group};
     out.tree.groups = {groups};
     out.tree.blocks = {blocks};
+    out.tree.light_parts = {light_parts};
     out.gravity = {gravity};
     out.forces = varpin::Forces(std::vector<varpin::Element>{forces});
     out.controls = {controls};
@@ -94,6 +95,7 @@ def header(scene: vp.Scene) -> str:
         bodies="\n".join(bodies),
         blocks=cpp(list(zip(begins, tree.ends, strict=True))),
         forces=elements(scene),
+        light_parts=cpp(list(zip(tree.loads, tree.carried, strict=True))),
         actuation=cpp([(r, c, scene.actuation[r, c]) for r, c in np.argwhere(scene.actuation)]),
         **fields,
     )
