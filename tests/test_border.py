@@ -20,7 +20,7 @@ N, P = 4, 2
 NOISE = vp.AdditiveNoise(1e-3) + vp.ControlNoise(0.1) + vp.StateNoise(0.1)
 TREE = (
     "parent", "prismatic", "rotation", "translation", "mass", "center", "inertia", "coordinate", "ratio", "offset",
-    "origin", "periodic", "armature", "group", "groups", "ends",
+    "origin", "loads", "carried", "periodic", "armature", "group", "groups", "ends",
 )  # fmt: skip
 PLACES = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio", "offset", "mass", "center")
 GUARDS = {"active": True, "branch_margin": 0.5, "energy_balance": 5e-3, "energy_budget": 0.02, "most_halvings": 12}

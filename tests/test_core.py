@@ -85,6 +85,7 @@ def test_paths_with_controls_of_their_own(integrator, line):
         ("mass", [1.0], ("mass", "1")),
         ("ends", [1], "block"),
         ("ends", [3], "blocks"),
+        ("loads", [0], ("carried", "0", "1")),
     ],
 )
 def test_what_is_no_tree_is_refused(field, value, facts):
@@ -191,7 +192,7 @@ def test_matrices_beyond_the_range_of_indices_are_refused_before_there_is_room_f
         "group",
     )}  # fmt: skip
     own |= {"parent": np.arange(-1, n - 1), "coordinate": np.arange(n), "origin": np.repeat([1, 0], [1, n - 1])}
-    own |= {"ends": np.array([n])}
+    own |= {"loads": np.zeros(0, dtype=np.int64), "carried": np.zeros((0, n), dtype=np.int64), "ends": np.array([n])}
     own |= {"actuation": np.zeros((n, 0)), "constant": np.zeros((n, 0)), "control": np.zeros((n, 0, 0))}
     own |= {"quadratic": np.zeros((n, 0)), "centers": np.zeros((n, 0))}
     own |= {"forces": [], "couplings": [], "constraints": ConstraintRows(), "custom": None}

@@ -53,6 +53,29 @@ def test_groups_that_couplings_join():
     assert not about(motion.warnings, "error")
 
 
+def carrier():
+    """A heavy wheel that carries a light pendulum of two links."""
+    model = pin.Model()
+    parent = 0
+    for k, mass in enumerate((500.0, 0.01, 0.01)):
+        parent = model.addJoint(parent, pin.JointModelRY(), pin.SE3(np.eye(3), np.array([0.3 * k, 0, 0])), f"j{k}")
+        model.appendBodyToJoint(parent, pin.Inertia.FromSphere(mass, 0.2), pin.SE3(np.eye(3), np.array([0.2, 0, 0])))
+        placement = pin.SE3(np.eye(3), np.array([0.3, 0, 0]))
+        model.addFrame(pin.Frame(f"tip{k}", parent, 0, placement, pin.FrameType.OP_FRAME))
+    return vp.load_robot(model)
+
+
+@pytest.mark.parametrize("ends", [("tip2", "tip0"), ("tip2", [0.5, 0.0, -0.8]), ("tip2", "tip1")])
+def test_light_parts_balance_with_springs(ends):
+    """A spring on a light part belongs to its balance: steps that resolve the motion stay whole."""
+    robot = carrier()
+    assert robot.tree.loads.size
+    scene = vp.Scene(robot, forces=[vp.FrameSpring(*ends, 2.0), vp.FrameDamper(*ends, 0.002)])
+    q, v = np.array([0.1, 0.8, -0.5]), np.array([0.4, 0.0, 1.0])
+    motion = vp.simulate(scene, q, v, dt=2e-3, steps=500, integrator=vp.Gauss(2), check=False)
+    assert motion.statistics.split_steps == 0
+
+
 def test_scenes_show_their_frame_forces():
     scene = vp.Scene(vp.load_robot("ur5"), forces=vp.FrameSpring("tool0", ("forearm_link", [0.05, 0.1, 0.0]), 8.0))
     assert "FrameSpring(a='tool0', b=('forearm_link', [0.05, 0.1, 0.0]), stiffness=8.0, rest=0.0)" in repr(scene.forces)

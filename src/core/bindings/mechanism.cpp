@@ -239,6 +239,18 @@ void take_blocks(Tree& tree, const Integers<1>& ends, int n) {
     if (begin != n) throw std::invalid_argument("the last block must end with the last coordinate");
 }
 
+void take_light_parts(Tree& tree, const Integers<1>& loads, const Integers<2>& carried) {
+    for (std::size_t r = 0; r < loads.shape(0); ++r) {
+        if (loads(r) < 0 || loads(r) >= static_cast<std::int64_t>(tree.bodies.size()) ||
+            tree.bodies[loads(r)].parent < 0)
+            throw std::invalid_argument("the first body of a light part must have a parent");
+        LightPart part;
+        part.body = static_cast<int>(loads(r));
+        for (std::size_t c = 0; c < carried.shape(1); ++c) part.carried.push_back(carried(r, c) != 0);
+        tree.light_parts.push_back(part);
+    }
+}
+
 Forces forces_of(const Named& forces, int n) {
     std::vector<Element> elements;
     for (const auto& [kind, coordinate, values] : forces) {
@@ -260,16 +272,17 @@ Couplings couplings_of(const NamedCouplings& couplings, const std::vector<Body>&
 
 Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation, In<2> translation, In<1> mass,
                        In<2> center, In<2> inertia, Integers<1> coordinate, In<1> ratio, In<1> offset,
-                       Integers<1> origin, Integers<1> periodic, In<1> armature, Integers<1> group, int groups,
-                       Integers<1> ends, In<1> gravity, const Named& forces, const NamedCouplings& couplings,
-                       const NamedConstraints& constraints, nb::object custom, In<2> actuation, In<2> constant,
-                       In<3> control, In<2> quadratic, In<2> centers) {
+                       Integers<1> origin, Integers<1> loads, Integers<2> carried, Integers<1> periodic, In<1> armature,
+                       Integers<1> group, int groups, Integers<1> ends, In<1> gravity, const Named& forces,
+                       const NamedCouplings& couplings, const NamedConstraints& constraints, nb::object custom,
+                       In<2> actuation, In<2> constant, In<3> control, In<2> quadratic, In<2> centers) {
     const std::size_t bodies = parent.shape(0), n = armature.shape(0), m = actuation.shape(1);
     const std::size_t processes = constant.shape(1);
     require(origin, "origin", {bodies});
     require(mass, "mass", {bodies});
     require(center, "center", {bodies, 3});
     require(inertia, "inertia", {bodies, 6});
+    require(carried, "carried", {loads.shape(0), n});
     require_each({n}, "group", group, "periodic", periodic);
     require(gravity, "gravity", {3});
     require(actuation, "actuation", {n, m});
@@ -282,6 +295,7 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
     describe_links(out.tree, mass, center, inertia, origin);
     take_coordinates(out.tree, group, groups, periodic);
     take_blocks(out.tree, ends, static_cast<int>(n));
+    take_light_parts(out.tree, loads, carried);
     out.tree.armature = copied(armature);
     out.gravity = {gravity(0), gravity(1), gravity(2)};
     out.forces = forces_of(forces, static_cast<int>(n));
@@ -443,10 +457,10 @@ void register_mechanism(nb::module_& m) {
     m.def("coupling_kinds", &coupling_kinds);
     nb::class_<Mechanism>(m, "Mechanism")
         .def_static("make", &mechanism_of, nb::kw_only(), "parent"_a, "prismatic"_a, "rotation"_a, "translation"_a,
-                    "mass"_a, "center"_a, "inertia"_a, "coordinate"_a, "ratio"_a, "offset"_a, "origin"_a, "periodic"_a,
-                    "armature"_a, "group"_a, "groups"_a, "ends"_a, "gravity"_a, "forces"_a, "couplings"_a,
-                    "constraints"_a, "custom"_a.none(), "actuation"_a, "constant"_a, "control"_a, "quadratic"_a,
-                    "centers"_a)
+                    "mass"_a, "center"_a, "inertia"_a, "coordinate"_a, "ratio"_a, "offset"_a, "origin"_a, "loads"_a,
+                    "carried"_a, "periodic"_a, "armature"_a, "group"_a, "groups"_a, "ends"_a, "gravity"_a, "forces"_a,
+                    "couplings"_a, "constraints"_a, "custom"_a.none(), "actuation"_a, "constant"_a, "control"_a,
+                    "quadratic"_a, "centers"_a)
         .def("jet", &jet, "q"_a, "v"_a)
         .def("jets", &jets, "q"_a, "v"_a)
         .def("velocity_slopes", &velocity_slopes_at, "q"_a, "v"_a)

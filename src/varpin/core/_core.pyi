@@ -32,6 +32,8 @@ class Mechanism:
         ratio: Floats,
         offset: Floats,
         origin: Integers,
+        loads: Integers,
+        carried: Integers,
         periodic: Integers,
         armature: Floats,
         group: Integers,

@@ -33,6 +33,8 @@ class Tree(NamedTuple):
     ratio: Floats  # (b,)
     offset: Floats  # (b,) [rad or m]
     origin: Integers  # (b,) 1 below prismatic joints only: moments of its subtree are taken about its own joint
+    loads: Integers  # (l,) first bodies of subtrees that are light compared to their carriers
+    carried: Integers  # (l, n) 1 where a coordinate belongs to the subtree
     periodic: Integers  # (n,) 1 where the Lagrangian without springs is the same after a whole turn
     armature: Floats  # (n,) [kg m^2 or kg]
     group: Integers  # (n,) which of r mechanically independent groups a coordinate belongs to, from 0

@@ -441,7 +441,7 @@ class Scene(Frozen):
         fields, rows = self.diffusion, self.bound_constraints.rows
         return mechanism(
             self.robot.tree,
-            periodic=self._periodic(),
+            **(self._constrained_tree() if self.constraints else {}),
             group=self.group,
             groups=int(self.group.max()) + 1,
             ends=np.array([self.robot.dof]) if self.constraints else block_ends(self.group),
@@ -463,13 +463,17 @@ class Scene(Frozen):
             centers=fields.center,
         )
 
-    def _periodic(self) -> NDArray[np.int64]:
-        """Which coordinates are periodic in a full turn (n,): no tied ones, and none under custom constraints."""
-        rows, periodic = self.bound_constraints.rows, self.robot.tree.periodic.copy()
+    def _constrained_tree(self) -> dict[str, NDArray[np.int64]]:
+        """Fields of the tree that differ under constraints."""
+        tree, rows = self.robot.tree, self.bound_constraints.rows
+        # Constraints do work on light parts, so these have no energy balance of their own.
+        changed = {"loads": tree.loads[:0], "carried": tree.carried[:0]}
+        # Ties, and possibly custom constraints, are not periodic in a full turn.
+        periodic = tree.periodic.copy()
         periodic[[c for tie in rows.ties for c in (tie.follower, tie.leader)]] = 0
         if rows.customs:
             periodic[:] = 0
-        return periodic
+        return changed | {"periodic": periodic}
 
     @cached_property
     def bounds(self) -> Floats:

@@ -1,10 +1,12 @@
 """A Pinocchio model as flat arrays, with joint frames turned so that every joint axis is z."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Integers
 from varpin.core import Mechanism
@@ -95,9 +97,12 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
     np.add.at(armature, coordinate, np.asarray(model.armature) * bodies["ratio"] ** 2)
     if not (np.isfinite(armature).all() and (armature >= 0.0).all()):
         raise RobotError(f"armature must be finite and >= 0, got {armature}")
+    loads, carried = _light_parts(bodies, len(coordinates))
     return Tree(
         **bodies,
         origin=origins(parent, prismatic),
+        loads=loads,
+        carried=carried,
         periodic=periodic_coordinates(coordinate, prismatic, bodies["ratio"], len(coordinates)),
         armature=armature,
         group=group,
@@ -147,6 +152,64 @@ def origins(parent: Integers, prismatic: Integers) -> Integers:
         if above >= 0:
             origin[body] = origin[above] and prismatic[above]
     return origin
+
+
+# A part is light if its share of the inertia about a joint above it is below this.
+LIGHT = 0.005
+
+
+def ancestors(parent: Integers) -> NDArray[np.bool_]:
+    """Ancestors of each body (b, b), itself included: [j, a] is True where a is an ancestor of j or j itself."""
+    is_ancestor = np.eye(len(parent), dtype=bool)
+    for body, above in enumerate(parent):
+        if above >= 0:
+            is_ancestor[body] |= is_ancestor[above]
+    return is_ancestor
+
+
+def _light_parts(tree: Mapping[str, Any], dof: int) -> tuple[Integers, Integers]:
+    """Light subtrees, whose energy is negligible beside that of the bodies that carry them.
+
+    Their inertia is compared with that of their carrier with all joints stretched out, which bounds both.
+
+    Returns:
+        The root body of each light subtree (l,), and whether each coordinate moves within it (l, n): 1 or 0.
+    """
+    parent, prismatic, mass = tree["parent"], tree["prismatic"], tree["mass"]
+    bodies = len(parent)
+    is_ancestor = ancestors(parent)
+    path = np.zeros(bodies)  # length along the offsets between joints, from the root
+    for b in range(bodies):
+        path[b] = np.linalg.norm(tree["translation"][b]) + (path[parent[b]] if parent[b] >= 0 else 0.0)
+    # [a, b]: inertia of body b about the joint of its ancestor a.
+    with np.errstate(over="ignore", invalid="ignore"):
+        reach = np.linalg.norm(tree["center"], axis=1) + path - path[:, None]
+        slides = prismatic[:, None] == 1
+        about = mass * np.where(slides, 1.0, reach**2)
+        about += np.where(slides, 0.0, tree["inertia"][:, [0, 2, 5]].sum(axis=1) / 2.0)
+        about[~is_ancestor.T] = 0.0
+        # [a, j]: inertia, about joint a, of all bodies that joint j carries.
+        carries = about @ is_ancestor
+        light = carries < LIGHT * np.diag(carries)[:, None]
+    carrier = np.full(bodies, -1)  # root of the light subtree that a body is in
+    joints, rows = [], []
+    movers = np.zeros((bodies, dof))
+    movers[np.arange(bodies), tree["coordinate"]] = 1.0
+    movable = is_ancestor.T.astype(float) @ movers  # [j, c]: how many bodies that joint j carries coordinate c moves
+    elsewhere = movers.sum(axis=0) - movable
+    for j in range(bodies):
+        if parent[j] < 0:
+            continue
+        carrier[j] = carrier[parent[j]]
+        if ((movable[j] > 0) & (elsewhere[j] > 0)).any():  # a mimic joint outside the subtree moves, too
+            continue
+        above = np.flatnonzero(is_ancestor[j])[:-1]
+        if light[above[carrier[above] == carrier[j]], j].any():
+            carrier[j] = j
+            joints.append(j)
+            rows.append(movable[j] > 0)
+    shape = (len(joints), dof)
+    return np.array(joints, dtype=np.int64), np.array(rows, dtype=np.int64).reshape(shape)
 
 
 def periodic_coordinates(coordinate: Integers, prismatic: Integers, ratio: Floats, dof: int) -> Integers:

@@ -2,7 +2,8 @@
 //
 // The branch guard: the step equation has other roots than the one that is connected to h -> 0, where the symmetric
 // part of N = -dr/dv is positive definite. The energy guard: |dE - work of the forces| over a substep must be a small
-// part of the energy turned over, for each mechanically independent group.
+// part of the energy turned over, for each mechanically independent group. That balance does not resolve parts that
+// ride on far heavier ones, so light parts have a balance of their own, of their Jacobi energy sum_i p_i v_i - L.
 #pragma once
 
 #include <algorithm>
@@ -46,11 +47,27 @@ struct Share {
     double largest = 0.0;
 };
 
+// The balance of a light part at a node; the carrier's L_q and L_v in all coordinates.
+struct PartLedger {
+    double jacobi = 0.0;
+    double potential = 0.0;
+    double scale = 0.0;  // magnitude of their terms
+    double defect = 0.0;
+    double most = 0.0;
+    std::vector<double> Lq, Lv;  // (n)
+};
+
 // Energies of a path at its last node.
 struct Energies {
-    explicit Energies(const Tree& tree) : group(tree.groups), share(tree.dof()) {}
+    explicit Energies(const Tree& tree) : group(tree.groups), share(tree.dof()), part(tree.light_parts.size()) {
+        for (PartLedger& ledger : part) {
+            ledger.Lq.resize(tree.dof());
+            ledger.Lv.resize(tree.dof());
+        }
+    }
     std::vector<Ledger> group;
     std::vector<Share> share;
+    std::vector<PartLedger> part;
 
     double total() const {
         double sum = 0.0;
@@ -79,7 +96,11 @@ struct Trial {
 class EnergyGuard {
   public:
     EnergyGuard(const Mechanism& mechanism, bool dense, bool matrices, const Kernels& kernels = kernels_for<>)
-        : mechanism(mechanism), kernels(kernels), n(mechanism.dof()), jet(mechanism.tree, false) {
+        : mechanism(mechanism),
+          kernels(kernels),
+          n(mechanism.dof()),
+          jet(mechanism.tree, false),
+          part(Energies(mechanism.tree).part) {
         mechanism.couplings.fit(jet.couplings);
         if (!dense && eliminates(mechanism.tree)) {
             articulated.emplace(mechanism.tree);
@@ -124,13 +145,18 @@ class EnergyGuard {
     }
 
     // Start at a node, without earlier errors.
-    void begin(Energies& energies) {
+    void begin(const double* q, const double* p, const double* v, Energies& energies) {
         for (int r = 0; r < mechanism.tree.groups; ++r) energies.group[r] = {kinetic[r], jet.potential[r], 0.0, 0.0};
         for (int i = 0; i < n; ++i) energies.share[i] = {share[i], share[i], share[i]};
+        light_parts(q, p, v);
+        for (std::size_t r = 0; r < part.size(); ++r) {
+            part[r].defect = part[r].most = 0.0;
+            energies.part[r] = part[r];
+        }
     }
 
     // Update velocity and energy after a kick of the momentum, without an error.
-    void kicked(const double* p, double* v, Energies& energies) {
+    void kicked(const double* q, const double* p, double* v, Energies& energies) {
         velocity(p, v);
         find_turnover(energies);
         for (int r = 0; r < mechanism.tree.groups; ++r) {
@@ -138,6 +164,12 @@ class EnergyGuard {
             energies.group[r].most = std::max(energies.group[r].most, turnover[r]);
         }
         update_shares(0.0, energies);
+        light_parts(q, p, v);
+        for (std::size_t r = 0; r < part.size(); ++r) {
+            part[r].defect = energies.part[r].defect;
+            part[r].most = energies.part[r].most;
+            energies.part[r] = part[r];
+        }
     }
 
     // The distance of the root from the fold where branches of solutions meet, (G1): 1 as h -> 0, <= 0 for a refused
@@ -158,7 +190,9 @@ class EnergyGuard {
 
     // Velocity and energy at the end of a substep, and whether its energy balance closes; if so, updates the ledgers.
     // `factored`: the factors of M at the end are known.
-    Outcome accept(const Guards& guards, const Tableau& tableau, Energies& energies, Trial& trial, bool factored) {
+    Outcome accept(const Guards& guards, const Tableau& tableau, Energies& energies,
+                   const std::vector<Coordinate>& from, const std::vector<double>& from_v, Trial& trial,
+                   bool factored = false) {
         for (int i = 0; i < n; ++i) {
             trial.at[i] = trial.position[i].value.high;
             trial.momentum[i] = trial.p[i].high;
@@ -187,6 +221,13 @@ class EnergyGuard {
                     return Outcome::energy;
             }
         }
+        if (guards.active && !part.empty()) {
+            light_parts(trial.at.data(), trial.momentum.data(), trial.v.data());
+            for (std::size_t r = 0; r < part.size(); ++r) {
+                if (!part_balanced(limit, energies, from, from_v, trial, r)) return Outcome::energy;
+            }
+            std::copy(part.begin(), part.end(), energies.part.begin());
+        }
         for (int r = 0; r < tree.groups; ++r) update_ledger(energies.group[r], r);
         update_shares(fade, energies);
         return Outcome::solved;
@@ -197,6 +238,7 @@ class EnergyGuard {
     friend struct Sized;
     static constexpr double fade = 1.0 / 256.0;     // decay per substep of the recorded variation of kinetic energies
     static constexpr double rounding = 1e-12;       // relative to the magnitudes of the terms of an energy or a work
+    static constexpr double part_factor = 4.0;      // for light parts, because of the error of the trapezoidal rule
     static constexpr double least_fraction = 0.02;  // of the limit remains, or a full ledger would stop the motion
 
     struct Limit {
@@ -228,6 +270,7 @@ class EnergyGuard {
     std::vector<double> share = zeros(n);
     std::vector<double> diagonal = zeros(n);  // of the branch guard
     std::vector<double> curved, mass;  // (n, n) of the branch guard, unless the step equation is solved by elimination
+    std::vector<PartLedger> part;      // at the trial node
 
     // branch_margin from the matrices of the stages' jets.
     template <class Size, class Stages>
@@ -308,6 +351,109 @@ class EnergyGuard {
         double defect = ledger.defect + error_of(ledger, r);
         if (lost[r] > 0.0) defect *= std::max(0.0, 1.0 - lost[r] / (lost[r] + std::max(kinetic[r], ledger.kinetic)));
         ledger = {kinetic[r], jet.potential[r], defect, std::max(ledger.most, turnover[r])};
+    }
+
+    // Whether a body is in the subtree of `top`; parents come first.
+    bool below(int body, int top) const {
+        while (body > top) body = mechanism.tree.bodies[body].parent;
+        return body == top;
+    }
+
+    // Jacobi energy, potential energy and the carrier's derivatives of each light part at a node.
+    void light_parts(const double* q, const double* p, const double* v) {
+        if (part.empty()) return;
+        const Tree& tree = mechanism.tree;
+        const Vec3<double>& g = mechanism.gravity;
+        const double strength = detail::norm1(g);
+        kernels.first_order(mechanism, q, v, jet);
+        for (std::size_t r = 0; r < part.size(); ++r) {
+            const LightPart& light = tree.light_parts[r];
+            PartLedger& ledger = part[r];
+            const auto& top = jet.body[light.body];
+            const int carrier = tree.bodies[light.body].parent;
+            const double carried = 0.5 * dot(jet.body[carrier].velocity, top.momentum);
+            // The height of the part's origin is left out of the potential, and of the carrier's L_q.
+            ledger.potential = -dot(g, top.inertia.moment);
+            ledger.scale = strength * detail::norm1(top.inertia.moment) + std::abs(carried);
+            for (int b = light.body; b < tree.size(); ++b) {
+                const Body& link = tree.bodies[b];
+                if (!link.origin || !below(b, light.body)) continue;
+                const auto& there = jet.body[b];
+                // Moments below an origin are taken about it, and it translates.
+                if (b > light.body) {
+                    ledger.potential -= dot(g, there.inertia.moment);
+                    ledger.scale += strength * detail::norm1(there.inertia.moment);
+                }
+                if (link.prismatic) {
+                    const double slid = link.ratio * q[link.coordinate] + link.offset;
+                    ledger.potential -= there.inertia.mass * slid * dot(g, there.axis.linear);
+                    ledger.scale += strength * there.inertia.mass * std::abs(slid);
+                }
+            }
+            ledger.jacobi = -carried;
+            std::fill(ledger.Lq.begin(), ledger.Lq.end(), 0.0);
+            std::fill(ledger.Lv.begin(), ledger.Lv.end(), 0.0);
+            for (int c = 0; c < n; ++c) {
+                if (!light.carried[c]) continue;
+                ledger.jacobi += 0.5 * p[c] * v[c];
+                ledger.scale += std::abs(p[c] * v[c]);
+            }
+            mechanism.forces.potentials(q, [&](int c, const Potential<double>& element) {
+                if (!light.carried[c]) return;
+                ledger.potential += element.energy;
+                ledger.scale += element.magnitude(q[c]);
+            });
+            // A coupling on the part belongs to its Lagrangian, and depends on other coordinates too.
+            mechanism.couplings.potentials(
+                q, jet.couplings, [&](const auto& arms, const auto& coupling, double, double size) {
+                    const auto carried = [&](const Arm<double>& arm) { return light.carried[arm.coordinate] != 0; };
+                    if (std::none_of(arms.begin(), arms.end(), carried)) return;
+                    ledger.potential += coupling.energy;
+                    ledger.scale += size;
+                    for (const Arm<double>& arm : arms) {
+                        if (!carried(arm)) ledger.Lq[arm.coordinate] -= dot(coupling.slope, arm.linear);
+                    }
+                });
+            const Force<double> weight{top.inertia.mass * g, cross(top.inertia.moment, g)};
+            for (int a = carrier; a >= 0; a = tree.bodies[a].parent) {
+                const Body& link = tree.bodies[a];
+                const auto& there = jet.body[a];
+                double slope = dot(there.axis_rate, top.momentum);
+                if (!(link.origin && link.prismatic)) slope += dot(there.axis, weight);
+                ledger.Lq[link.coordinate] += link.ratio * slope;
+                ledger.Lv[link.coordinate] += link.ratio * dot(there.axis, top.momentum);
+            }
+            ledger.jacobi += ledger.potential;
+        }
+    }
+
+    // Whether the balance of light part r closes over a substep; writes its ledger into `part`.
+    bool part_balanced(const Limit& limit, const Energies& energies, const std::vector<Coordinate>& from,
+                       const std::vector<double>& from_v, const Trial& trial, std::size_t r) {
+        const PartLedger& old = energies.part[r];
+        PartLedger& ledger = part[r];
+        double work = 0.0, drive = 0.0, exchanged = 0.0, turned = 0.0, magnitude = 0.0;
+        for (int c = 0; c < n; ++c) {
+            if (mechanism.tree.light_parts[r].carried[c]) {
+                work += trial.work[c];
+                magnitude += trial.magnitude[c];
+                turned += varied(energies, c);
+                continue;
+            }
+            const Compensated &now = trial.position[c].value, &then = from[c].value;
+            const double by_position =
+                0.5 * (old.Lq[c] + ledger.Lq[c]) * ((now.high - then.high) + (now.low - then.low));
+            const double by_rate = 0.5 * (old.Lv[c] + ledger.Lv[c]) * (trial.v[c] - from_v[c]);
+            drive += by_position + by_rate;
+            exchanged += std::abs(by_position) + std::abs(by_rate);
+        }
+        const double error = (ledger.jacobi - old.jacobi) - work + drive;
+        exchanged += std::abs(ledger.potential - old.potential) + std::abs(work);
+        const double most = limit.of(error, old.defect, turned, exchanged, part_factor * old.most);
+        ledger.defect = old.defect + error;
+        ledger.most = std::max(old.most, turned);
+        return std::abs(error) <=
+               part_factor * most + rounding * (old.scale + ledger.scale + exchanged + magnitude) + nothing;
     }
 };
 

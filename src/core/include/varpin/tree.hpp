@@ -33,6 +33,12 @@ struct Block {
     int end = 0;
 };
 
+// A subtree that is light compared with the bodies that carry it, with an energy balance of its own (guards.hpp).
+struct LightPart {
+    int body = 0;               // root of the subtree
+    std::vector<char> carried;  // (n) whether a coordinate belongs to it
+};
+
 struct Tree {
     std::vector<Body> bodies;
     std::vector<double> armature;  // (n) [kg m^2 or kg]
@@ -40,6 +46,7 @@ struct Tree {
     std::vector<int> group;        // (n) mechanically independent group of a coordinate
     int groups = 0;
     std::vector<Block> blocks;  // in order; they cover all coordinates
+    std::vector<LightPart> light_parts;
 
     int dof() const { return static_cast<int>(armature.size()); }
     int size() const { return static_cast<int>(bodies.size()); }

@@ -139,7 +139,7 @@ class VariationalStepper {
         diffusion_centers(mechanism, q, state.center.data());
         state.known = state.level = state.trend = state.impulse_trend = 0;
         if (!enter(state, project)) return false;
-        energy_guard.begin(state.energies);
+        energy_guard.begin(at.data(), state.momentum.data(), state.v.data(), state.energies);
         return true;
     }
 
@@ -164,9 +164,10 @@ class VariationalStepper {
         for (int i = 0; i < n; ++i) {
             state.p[i] = state.p[i].plus(impulse[i]);
             state.momentum[i] = state.p[i].high;
+            at[i] = state.position[i].value.high;
         }
         absorb(state);
-        energy_guard.kicked(state.momentum.data(), state.v.data(), state.energies);
+        energy_guard.kicked(at.data(), state.momentum.data(), state.v.data(), state.energies);
     }
 
     // Set the force of a step: (n) constant over it, or (s, n) at its stages if it `varies`; and the rates of cubic
@@ -326,7 +327,7 @@ class VariationalStepper {
         stages == 1 ? advance(1, h, state) : advance(stages, h, state);
         outcome = end(h, state, jets_wanted);
         if (outcome != Outcome::solved) return outcome;
-        outcome = energy_guard.accept(guards, tableau, state.energies, trial, m > 0);
+        outcome = energy_guard.accept(guards, tableau, state.energies, state.position, state.v, trial, m > 0);
         if (outcome != Outcome::solved) return outcome;
         effort.branch_margin = std::min(effort.branch_margin, margin);
         ++effort.substeps;
