@@ -32,7 +32,7 @@ Extremes = dict[str, tuple[float, int]]
 _GROUP = 32
 # A worker simulates one chunk of paths at a time. Its size depends on the ensemble alone, so that sums do not depend on
 # the number of workers: the number of chunks aimed at, then bounds of a chunk in steps and in paths.
-_CHUNKS, _LEAST_STEPS, _MOST_STEPS, _MOST_PATHS = 64, 4_000, 200_000, 1024
+_CHUNKS, _LEAST_STEPS, _MOST_STEPS, _FEWEST_PATHS, _MOST_PATHS = 64, 4_000, 200_000, 16, 1024
 
 
 def without_geometry(scene: Scene) -> Scene:
@@ -46,7 +46,7 @@ def chunks(steps: int, paths: int) -> Iterator[tuple[int, int]]:
     """The first path of each chunk, and one past its last."""
     steps = max(1, steps)
     size = min(max(math.ceil(paths / _CHUNKS), _LEAST_STEPS // steps), _MOST_STEPS // steps, _MOST_PATHS)
-    size = max(1, math.ceil(size / _GROUP)) * _GROUP
+    size = max(size, _FEWEST_PATHS) if size <= _GROUP else math.ceil(size / _GROUP) * _GROUP
     return ((first, min(first + size, paths)) for first in range(0, paths, size))
 
 
