@@ -111,13 +111,15 @@ class Moments(Frozen):
     @classmethod
     @np.errstate(over="ignore", invalid="ignore")
     def of(cls, x: Floats, nodes: Integers) -> Moments:
-        """Sums of x and the energy (N + 1, 2n + 1, C), the first ``nodes`` (C,) of each path."""
-        there = np.arange(len(x))[:, None] < nodes
-        count = there.sum(axis=1)
-        mean = np.where(there[:, None], x, 0.0).sum(axis=2) / np.maximum(count, 1)[:, None]
-        apart = np.where(there[:, None], x - mean[:, :, None], 0.0)
-        squares = np.einsum("jaP,jbP->jab", apart[:, :-1], apart[:, :-1])
-        return cls(count, mean, squares, np.einsum("jP,jP->j", apart[:, -1], apart[:, -1]))
+        """Sums of x and the energy (N + 1, 2n + 1, C), the first ``nodes`` (C,) of each path; x is overwritten."""
+        gone = np.arange(len(x))[:, None] >= nodes
+        count = len(nodes) - gone.sum(axis=1)
+        np.copyto(x, 0.0, where=gone[:, None])
+        mean = x.sum(axis=2) / np.maximum(count, 1)[:, None]
+        x -= mean[:, :, None]
+        np.copyto(x, 0.0, where=gone[:, None])
+        squares = np.einsum("jaP,jbP->jab", x[:, :-1], x[:, :-1])
+        return cls(count, mean, squares, np.einsum("jP,jP->j", x[:, -1], x[:, -1]))
 
     @np.errstate(over="ignore", invalid="ignore")
     def merged(self, other: Moments) -> Moments:
@@ -167,9 +169,12 @@ def simulate_paths(task: Task) -> Part:
     for name, values in (("split", split), ("energy", energy), ("speed", np.abs(second))):
         most = np.fmax.reduce(values.reshape(P, -1), axis=1, initial=-np.inf)
         extremes[name] = float(most.max()), task.first + int(np.argmax(most))
-    # Statistics run over the paths, which are the last axis.
-    x = np.concatenate([q, second, energy[:, :, None]], axis=2) if task.moments else np.empty((0, 0, 0))
-    moments = Moments.of(np.ascontiguousarray(x.transpose(1, 2, 0)), nodes) if task.moments else None
+    moments = None
+    if task.moments:
+        # Statistics run over the paths, which are the last axis.
+        x = np.empty((q.shape[1], 2 * q.shape[2] + 1, P))
+        np.concatenate([part.transpose(1, 2, 0) for part in (q, second, energy[:, :, None])], axis=1, out=x)
+        moments = Moments.of(x, nodes)
     return Part(task.first, nodes, tuple(failures), extremes, moments, {name: arrays[name] for name in task.kept})
 
 
