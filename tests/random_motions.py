@@ -281,7 +281,6 @@ def judge(case: Case, motion: vp.Trajectory, real: Truth | None) -> Verdict:
     off = np.abs(np.array([motion.q, motion.v]) - states).max(axis=1)
     least, share, doubt = max(1e-8, 5.0 * doubt[0].max()), (off / size).max(axis=1), (doubt / size).max(axis=1)
     loop = all("control l" in text for text in told)
-    loop = all("control l" in text for text in told)
     right = (share < RIGHT).all() and (doubt < 0.2 * RIGHT).all()
     labels = {"right", *(["loop" if loop else "told"] if told else [])} if right else set()
     for limit, after in ((WRONG, ""), (STRICT, " 1%")):

@@ -107,7 +107,10 @@ FUNCTIONS = {
         ensemble,
         ("q0", "v0", "dt", "steps", "paths", "rng", "controls", "quantiles", "store", "progress", "integrator"),
     ),
-    "policy": (fed, ("u", "gains", "reference", "hold", "on", "limits", "before", "period", "previous_gains")),
+    "policy": (
+        fed,
+        ("u", "gains", "reference", "hold", "on", "limits", "before", "period", "previous_gains", "integrator"),
+    ),
     "OpenLoop": (lambda **given: motion(controls=vp.OpenLoop(**given)), ("f",)),
     "Midpoint": (lambda **given: motion(integrator=vp.Midpoint(**given)), ("alpha", "guard", "tolerance", "kick")),
     "Gauss": (lambda **given: motion(integrator=vp.Gauss(**given)), ("stages",)),

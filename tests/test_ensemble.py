@@ -43,6 +43,12 @@ def test_same_bytes_for_any_number_of_workers(kick):
         same_statistics(other, one)
 
 
+def test_a_few_long_paths_are_work_for_four():
+    calls = []
+    run(paths=64, steps=300, workers=1, progress=lambda *done: calls.append(done))
+    assert calls == [(16, 64), (32, 64), (48, 64), (64, 64)]
+
+
 def test_same_bytes_for_one_path_or_a_thousand():
     many, few, one = (run(paths=paths) for paths in (1000, 45, 1))
     for name in ARRAYS:

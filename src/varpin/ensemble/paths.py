@@ -32,7 +32,7 @@ Extremes = dict[str, tuple[float, int]]
 _GROUP = 32
 # A worker simulates one chunk of paths at a time. Its size depends on the ensemble alone, so that sums do not depend on
 # the number of workers: the number of chunks aimed at, then bounds of a chunk in steps and in paths.
-_CHUNKS, _LEAST_STEPS, _MOST_STEPS, _MOST_PATHS = 64, 4_000, 200_000, 1024
+_CHUNKS, _LEAST_STEPS, _MOST_STEPS, _FEWEST_PATHS, _MOST_PATHS = 64, 4_000, 200_000, 16, 1024
 
 
 def without_geometry(scene: Scene) -> Scene:
@@ -46,7 +46,7 @@ def chunks(steps: int, paths: int) -> Iterator[tuple[int, int]]:
     """The first path of each chunk, and one past its last."""
     steps = max(1, steps)
     size = min(max(math.ceil(paths / _CHUNKS), _LEAST_STEPS // steps), _MOST_STEPS // steps, _MOST_PATHS)
-    size = max(1, math.ceil(size / _GROUP)) * _GROUP
+    size = max(size, _FEWEST_PATHS) if size <= _GROUP else math.ceil(size / _GROUP) * _GROUP
     return ((first, min(first + size, paths)) for first in range(0, paths, size))
 
 
@@ -111,13 +111,15 @@ class Moments(Frozen):
     @classmethod
     @np.errstate(over="ignore", invalid="ignore")
     def of(cls, x: Floats, nodes: Integers) -> Moments:
-        """Sums of x and the energy (N + 1, 2n + 1, C), the first ``nodes`` (C,) of each path."""
-        there = np.arange(len(x))[:, None] < nodes
-        count = there.sum(axis=1)
-        mean = np.where(there[:, None], x, 0.0).sum(axis=2) / np.maximum(count, 1)[:, None]
-        apart = np.where(there[:, None], x - mean[:, :, None], 0.0)
-        squares = np.einsum("jaP,jbP->jab", apart[:, :-1], apart[:, :-1])
-        return cls(count, mean, squares, np.einsum("jP,jP->j", apart[:, -1], apart[:, -1]))
+        """Sums of x and the energy (N + 1, 2n + 1, C), the first ``nodes`` (C,) of each path; x is overwritten."""
+        gone = np.arange(len(x))[:, None] >= nodes
+        count = len(nodes) - gone.sum(axis=1)
+        np.copyto(x, 0.0, where=gone[:, None])
+        mean = x.sum(axis=2) / np.maximum(count, 1)[:, None]
+        x -= mean[:, :, None]
+        np.copyto(x, 0.0, where=gone[:, None])
+        squares = np.einsum("jaP,jbP->jab", x[:, :-1], x[:, :-1])
+        return cls(count, mean, squares, np.einsum("jP,jP->j", x[:, -1], x[:, -1]))
 
     @np.errstate(over="ignore", invalid="ignore")
     def merged(self, other: Moments) -> Moments:
@@ -167,9 +169,12 @@ def simulate_paths(task: Task) -> Part:
     for name, values in (("split", split), ("energy", energy), ("speed", np.abs(second))):
         most = np.fmax.reduce(values.reshape(P, -1), axis=1, initial=-np.inf)
         extremes[name] = float(most.max()), task.first + int(np.argmax(most))
-    # Statistics run over the paths, which are the last axis.
-    x = np.concatenate([q, second, energy[:, :, None]], axis=2) if task.moments else np.empty((0, 0, 0))
-    moments = Moments.of(np.ascontiguousarray(x.transpose(1, 2, 0)), nodes) if task.moments else None
+    moments = None
+    if task.moments:
+        # Statistics run over the paths, which are the last axis.
+        x = np.empty((q.shape[1], 2 * q.shape[2] + 1, P))
+        np.concatenate([part.transpose(1, 2, 0) for part in (q, second, energy[:, :, None])], axis=1, out=x)
+        moments = Moments.of(x, nodes)
     return Part(task.first, nodes, tuple(failures), extremes, moments, {name: arrays[name] for name in task.kept})
 
 

@@ -20,7 +20,7 @@ from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import children
 from varpin.signals.controls import commands_of
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
-from varpin.simulation.choice import stronger, usual_integrator
+from varpin.simulation.choice import given_integrator, stronger, usual_integrator
 from varpin.simulation.start import in_other_units, on_constraints, time_steps
 from varpin.support.checks import (
     JointValues,
@@ -111,16 +111,13 @@ def simulate_ensemble(
     levels = require_finite("quantiles", as_floats("quantiles", quantiles))
     if levels.ndim != 1 or ((levels < 0.0) | (levels > 1.0)).any():
         raise InputError(f"quantiles must be levels in [0, 1], got {quantiles}")
-    if integrator is not None and not isinstance(integrator, Integrator):
-        raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
+    integrator = given_integrator(integrator, controls)
     if controls is None and (scene.servo_joints or scene.inputs):
         if (start[0] != start[0][0]).any():
             positions = "the scene has servos or inputs, and the paths begin at different positions"
             raise InputError(f"controls are needed: {positions}")
         controls = scene.command_at(start[0][0])
     start, moved = _onto_constraints(scene, start)
-    if integrator is None and isinstance(controls, LinearPolicy):
-        integrator = controls.integrator
     if integrator is None:
         noisy = scene.processes > 0
         some = np.linspace(0, paths - 1, 1 if noisy else min(1 + paths // _OF, _CHOOSING)).astype(np.int64)

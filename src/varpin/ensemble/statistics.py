@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import closing
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,12 +40,13 @@ def findings_of_paths(
     some = dict.fromkeys([0, *split, extremes["energy"][1], extremes["speed"][1]])
     tasks = [Task(shared, path, q0[path : path + 1].copy(), v0[path : path + 1].copy()) for path in some]
     found: dict[str, Finding] = {}
-    results = map(examine, tasks) if pool is None else in_order(pool, examine, tasks)
-    for path, findings in zip(some, results, strict=True):
-        for finding in findings:
-            kept = found.get(finding.kind)
-            if kept is None or (finding.value or 0.0) > (kept.value or 0.0):
-                found[finding.kind] = finding.about(f"path {path}: ")
+    results = (examine(task) for task in tasks) if pool is None else in_order(pool, examine, tasks)
+    with closing(results) as results:
+        for path, findings in zip(some, results, strict=True):
+            for finding in findings:
+                kept = found.get(finding.kind)
+                if kept is None or (finding.value or 0.0) > (kept.value or 0.0):
+                    found[finding.kind] = finding.about(f"path {path}: ")
     return tuple(found.values())
 
 

@@ -9,8 +9,10 @@ from typing import Literal
 import numpy as np
 
 from varpin.arrays import Floats
+from varpin.errors import InputError
 from varpin.integrators import Gauss, Integrator, Midpoint, Radau
 from varpin.mechanics.scene import Scene
+from varpin.signals.policy import LinearPolicy
 from varpin.simulation.spectrum import fastest_damping, pulls_fast, stops_ahead
 
 # The default, and the default under noise, where more stages do not raise the strong order.
@@ -22,6 +24,15 @@ _SWINGING, _TURNS = Gauss(4), 0.4
 _STOPPING, _RINGS = Radau(4), 2.0
 # Most joints of a robot for which rates are computed: for more it takes as long as a motion.
 _MOST_JOINTS = 200
+
+
+def given_integrator(integrator: object, controls: object = None) -> Integrator | None:
+    """The integrator that is given, else that of a policy; None where it is to be chosen."""
+    if integrator is None and isinstance(controls, LinearPolicy):
+        integrator = controls.integrator
+    if integrator is not None and not isinstance(integrator, Integrator):
+        raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
+    return integrator
 
 
 def usual_integrator(scene: Scene, q0: Floats, v0: Floats, dt: float, *, noisy: bool) -> Integrator:

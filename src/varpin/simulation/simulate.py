@@ -20,7 +20,7 @@ from varpin.signals.controls import Controls, commands_of
 from varpin.signals.functions import ControlLaw, Sampled, function_findings, require_law
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.check import check as checked
-from varpin.simulation.choice import usual_integrator
+from varpin.simulation.choice import given_integrator, usual_integrator
 from varpin.simulation.failures import Interrupted, StepFailure, named
 from varpin.simulation.loop import unstable_loop
 from varpin.simulation.record import MotionRecord, Progress, Reporter
@@ -125,8 +125,8 @@ def simulate(
     """
     joints = require_scene(scene).robot.joint_names
     q0, v0 = joint_array("q0", q0, joints), joint_array("v0", v0, joints)
-    if integrator is not None and not isinstance(integrator, Integrator):
-        raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
+    # A tolerance chooses among all integrators, also for a policy that has one.
+    integrator = given_integrator(integrator, controls if tolerance is None else None)
     if controls is None and (scene.servo_joints or scene.inputs):
         controls = scene.command_at(q0)
     accuracy: Accuracy | None = None
@@ -162,8 +162,6 @@ def simulate(
         # Given without those for slopes of the controls, which are zero then.
         width = scene.processes
     dw = wiener_increments(width, dt, steps, rng, increments)
-    if integrator is None and isinstance(controls, LinearPolicy):
-        integrator = controls.integrator
     if integrator is None:
         integrator = usual_integrator(scene, q0, v0, dt, noisy=len(dw) > 0)
     if isinstance(controls, OpenLoop) and not isinstance(controls, Sampled):

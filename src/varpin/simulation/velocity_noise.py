@@ -8,7 +8,6 @@ t, and under an integrator that keeps R of a velocity in a step of h, and N of a
 from __future__ import annotations
 
 import numpy as np
-import scipy
 
 from varpin.arrays import Floats
 from varpin.finding import Finding
@@ -55,18 +54,25 @@ def _covariances(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     q, v, dt, steps = trajectory.q[at], trajectory.v[at], trajectory.dt, trajectory.steps
     F = noise_fields(scene, trajectory, q, v, trajectory.q[0], at).F[:, :, : scene.processes]
     M, D = masses(scene, q), damping_matrices(scene, q, v, trajectory.u[at] @ scene.actuation.T, custom=True)
-    right, own, fastest = np.zeros(q.shape[1]), np.zeros(q.shape[1]), 0.0
-    for k in range(len(at)):
-        free = np.eye(q.shape[1])
-        if scene.constraints:
-            free = scipy.linalg.null_space(scene.core.constraints(q[k : k + 1].copy())[2][0])
-        rates, modes = scipy.linalg.eigh(free.T @ D[k] @ free, free.T @ M[k] @ free)
-        rates, modes = np.maximum(rates, _SLOWEST / (steps * dt)), free @ modes
-        kept, added = integrator.damped(dt * rates)
-        both, kept = np.add.outer(rates, rates), np.outer(kept, kept)
-        excited = modes.T @ F[k] @ F[k].T @ modes
-        right += np.einsum("ia,ab,ib->i", modes, excited * -np.expm1(-both * steps * dt) / both, modes)
-        sums = dt * np.outer(added, added) * (1.0 - kept**steps) / (1.0 - kept)
-        own += np.einsum("ia,ab,ib->i", modes, excited * sums, modes)
-        fastest = max(fastest, float(rates.max(initial=0.0)))
-    return right, own, fastest
+    one = free = np.eye(q.shape[1])
+    if scene.constraints:
+        C = scene.core.constraints(np.ascontiguousarray(q))[2]
+        free = one - np.linalg.pinv(C) @ C
+    # What constraints hold has a unit mass, no damper and no noise.
+    root = np.linalg.cholesky(free @ M @ free + one - free)
+    white = np.linalg.solve(root, np.swapaxes(np.linalg.solve(root, free @ D @ free), 1, 2))
+    rates, modes = np.linalg.eigh(white)
+    rates = np.maximum(rates, _SLOWEST / (steps * dt))
+    modes = free @ np.linalg.solve(np.swapaxes(root, 1, 2), modes)
+    kept, added = (factor.reshape(rates.shape) for factor in integrator.damped(dt * rates.ravel()))
+    excited = np.swapaxes(modes, 1, 2) @ F
+    excited = excited @ np.swapaxes(excited, 1, 2)
+
+    def pairs(factor: Floats) -> Floats:
+        return factor[:, :, None] * factor[:, None]
+
+    both = rates[:, :, None] + rates[:, None]
+    own = dt * pairs(added) * (1.0 - pairs(kept) ** steps) / (1.0 - pairs(kept))
+    right = -np.expm1(-both * steps * dt) / both
+    variances = (((modes @ (excited * sums)) * modes).sum(axis=(0, 2)) for sums in (right, own))
+    return *variances, float(rates.max())
