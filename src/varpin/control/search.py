@@ -248,8 +248,8 @@ class Search:
         self.along = Steps(self.problem, motion)
 
     def _enforce(self, between: Instants) -> None:
-        self.between, self.whole = between, enforced(self.problem, between)
-        self.bound: tuple[BoundConstraint, ...] = self.whole.bound_constraints
+        self.between = between
+        self.bound: tuple[BoundConstraint, ...] = enforced(self.problem, between).bound_constraints
         self.multipliers = [np.zeros(item.shape) for item in self.bound]
         self.tightening.enforce(self.bound, between)
         self._excess: list[Floats] = [np.zeros(item.size) for item in self.bound]  # in tenths of ranges
@@ -480,7 +480,7 @@ class Search:
             multipliers, used = self.multipliers[:count], margins.margins[:count]
             self._enforce(made)
             self.multipliers[:count], margins.margins[:count] = multipliers, used
-        elif ended is None or not margins.needed or not margins.widen(self.solution(Status.CONVERGED)):
+        elif ended is None or not (margins.countable and margins.widen(self.solution(Status.CONVERGED))):
             return False
         margins.renew(iteration)
         return True

@@ -50,6 +50,11 @@ class Tightening:
         """Whether rows have margins that noise widens."""
         return bool(self.problem.processes) and any(item.source.margin > 0.0 for item in self.bound)
 
+    @property
+    def countable(self) -> bool:
+        """Whether motions may be counted again."""
+        return self.needed and self.counts < _COUNTS
+
     def enforce(self, bound: tuple[BoundConstraint, ...], between: Instants) -> None:
         """Begin without margins on constraints, the last of which are at instants between nodes."""
         self.bound, self.between = bound, between
@@ -81,8 +86,6 @@ class Tightening:
 
     def widen(self, plan: Solution) -> bool:
         """Whether margins become wider, as motions under noise violate bounds more often than these promise."""
-        if not self.needed or self.counts >= _COUNTS:
-            return False
         self.counts += 1
         more = None
         with contextlib.suppress(VarpinError):
