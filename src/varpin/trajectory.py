@@ -402,5 +402,9 @@ def require_trajectory(motion: object) -> Trajectory:
 
 def kinematic_input_rows(trajectory: Trajectory) -> Floats:
     """Rows (joint, joint, rate, ...) of a record's ties that are kinematic inputs: joints tied to themselves."""
-    ties = trajectory.scene_values.get("constraints.ties", np.zeros((0, 3)))
+    none = np.zeros((0, 3))
+    ties = trajectory.scene_values.get("constraints.ties", none)
+    # A file may have other shapes.
+    if ties.ndim != 2 or ties.shape[1] < 3:
+        return none
     return np.asarray(ties[ties[:, 0] == ties[:, 1]], dtype=np.float64)
