@@ -192,7 +192,16 @@ class TestTheCoreGetsWhatFits:
 
     @pytest.mark.parametrize(
         ("name", "value"),
-        [("q", np.zeros((5, 2))), ("q", np.zeros((6, 3))), ("u", np.zeros((3, 2))), ("t", np.zeros(0))],
+        [
+            ("q", np.zeros((5, 2))),
+            ("q", np.zeros((6, 3))),
+            ("u", np.zeros((3, 2))),
+            ("t", np.zeros(0)),
+            ("constraint_forces", np.zeros((5, 1))),
+            ("u_stages", np.zeros((5, 2, 1))),
+            ("u_nodes", np.zeros((6, 3))),
+            ("error", np.zeros((5, 2))),
+        ],
     )
     def test_trajectories_changed_by_hand(self, name, value):
         motion = vp.simulate(SCENE, [0.1, 0.2], [0.0, 0.0], dt=1e-3, steps=5)
