@@ -131,7 +131,8 @@ class JointForce(Force):
 
     def bind(self, robot: Robot) -> tuple[Element, ...]:
         numbers: dict[str, Floats] = {}
-        for name in (item.name for item in fields(self) if not getattr(self, item.name) is item.default is None):
+        given = (item for item in fields(self) if item.default is not None or getattr(self, item.name) is not None)
+        for name in (item.name for item in given):
             none = _LIMITS.get(name, 0.0)
             values = joint_array(name, getattr(self, name), robot.joint_names, uniform=True, absent=none)
             if name in _LIMITS:
