@@ -16,7 +16,10 @@ from refusals import named, refused
 
 import varpin as vp
 from varpin.control.costs import BoundCost, Cost, Expansion
+from varpin.core.arrays import Diffusion, Element
 from varpin.errors import StepError
+from varpin.mechanics.forces import Force
+from varpin.mechanics.noise import BoundNoise, Noise
 
 ROBOT = vp.planar_chain(2)
 SCENE, NOISY = vp.Scene(ROBOT), vp.Scene(ROBOT, noise=vp.AdditiveNoise(1e-3))
@@ -174,6 +177,28 @@ def test_numbers_of_any_size(state, dt, integrator):
 
 
 class TestTheCoreGetsWhatFits:
+    @pytest.mark.parametrize("field", Diffusion._fields)
+    @pytest.mark.parametrize("value", [np.zeros((1, 1)), np.zeros((9, 9)), None, np.full((2, 2), np.inf, dtype="f4")])
+    def test_noise_of_one_s_own(self, field, value):
+        class Own(Noise):
+            def bind(self, actuation, joints):
+                fields = Diffusion(np.zeros((2, 2)), np.zeros((2, 2, 2)), np.zeros((2, 2)), np.zeros((2, 2)))
+                return BoundNoise(fields._replace(**{field: value}))
+
+        with pytest.raises((vp.InputError, AttributeError)) as info:
+            vp.Scene(ROBOT, noise=Own())
+        # Without the first array not even the number of processes is there.
+        assert info.type is vp.InputError or (field == "constant" and value is None)
+
+    @pytest.mark.parametrize("part", [1.0, "JointDamper", Element("JointDamper", 0, (np.nan,))])
+    def test_forces_of_one_s_own(self, part):
+        class Own(Force):
+            def bind(self, robot):
+                return (part,)
+
+        with refused(vp.InputError, "Own.bind", repr(part)):
+            vp.Scene(ROBOT, forces=Own())
+
     @pytest.mark.parametrize(
         ("gradient", "hessian"), [((5, 6), (2, 6, 6)), ((5, 6), (6, 6)), ((5, 1), (1, 6, 6)), ((1, 6), (5, 6, 6))]
     )
@@ -195,7 +220,16 @@ class TestTheCoreGetsWhatFits:
 
     @pytest.mark.parametrize(
         ("name", "value"),
-        [("q", np.zeros((5, 2))), ("q", np.zeros((6, 3))), ("u", np.zeros((3, 2))), ("t", np.zeros(0))],
+        [
+            ("q", np.zeros((5, 2))),
+            ("q", np.zeros((6, 3))),
+            ("u", np.zeros((3, 2))),
+            ("t", np.zeros(0)),
+            ("constraint_forces", np.zeros((5, 1))),
+            ("u_stages", np.zeros((5, 2, 1))),
+            ("u_nodes", np.zeros((6, 3))),
+            ("error", np.zeros((5, 2))),
+        ],
     )
     def test_trajectories_changed_by_hand(self, name, value):
         motion = vp.simulate(SCENE, [0.1, 0.2], [0.0, 0.0], dt=1e-3, steps=5)

@@ -127,6 +127,20 @@ def test_a_pass_is_the_equations(roots, dof, m, hold, k, regularization):
     np.testing.assert_allclose((run.slope, run.curvature, run.noise), sums, rtol=1e-9 if roots else 1e-10)
 
 
+def test_two_blocks_are_one_pass():
+    given, ends = random_steps(3, 2, 1, seed=1), terminal(6)
+    right, sums = plainly(given, 2, 0.0, *ends)
+    ours, run = empty(given, 2), core.BackwardPass(2, *ends)
+    for begin, end in ((4, 6), (0, 4)):
+        part = {name: array[begin:end] for name, array in given.items()}
+        views = {
+            name: array[begin:end] if name == "spread" else array[begin // 2 : end // 2] for name, array in ours.items()
+        }
+        assert run.run(H, 2, 0.0, **part, **views) == -1
+    close(ours, right, 10)
+    np.testing.assert_allclose((run.slope, run.curvature, run.noise), sums, rtol=1e-10)
+
+
 @pytest.mark.parametrize("hold", [1, 3])
 @pytest.mark.parametrize("limited", [False, True])
 def test_the_linearized_motion_under_gains_is_the_sum_of_its_steps(hold, limited):

@@ -101,6 +101,13 @@ def test_linear_controls_are_lines_through_the_nodes():
     np.testing.assert_allclose(line.get_xydata(), np.column_stack([motion.t, nodes]), atol=1e-12)
 
 
+@pytest.mark.parametrize("shape", [(3,), (1, 1), (2, 2, 2)])
+def test_controls_of_a_motion_whose_file_has_ties_of_another_shape(shape):
+    motion = vp.simulate(vp.Scene(vp.planar_chain(1)), [0.1], [0.0], dt=0.01, steps=2)
+    odd = dataclasses.replace(motion, scene_values={**motion.scene_values, "constraints.ties": np.ones(shape)})
+    assert plots.plot_controls(odd)[1].get_ylabel() == "control [N m or N]"
+
+
 BY_HAND = {"constraints": vp.KinematicInput("joint1"), "actuation": ["joint1"]}
 CUBIC = vp.KinematicInput("joint1", "cubic")
 

@@ -391,6 +391,12 @@ class TestInertia:
         vp.load_robot(path)
         assert "link 'tool' has a non-physical inertia" in caplog.text
 
+    @pytest.mark.parametrize("axis", ["0 0 0", "", "x y z", "0 1"])
+    def test_axes_of_fixed_joints_are_not_read(self, tmp_path, axis):
+        joints = joint("j1", "base", "l1"), joint("j2", "l1", "tool", "fixed", axis=axis)
+        robot = vp.load_robot(write_urdf(tmp_path, link("l1"), link("tool"), *joints))
+        assert [inertial.link for inertial in robot.inertials] == ["l1", "tool"]
+
     @pytest.mark.parametrize("ixx", [0.2, 0.0, 0.1])
     def test_that_a_body_has_is_not(self, tmp_path, caplog, ixx):
         vp.load_robot(arm(tmp_path, THIN.format(ixx)))

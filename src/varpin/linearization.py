@@ -24,7 +24,7 @@ from varpin.support.checks import as_floats, finite_array
 from varpin.support.differences import slopes
 from varpin.trajectory import Trajectory
 
-# Difference of the end of a step from the recorded one, as a share of its change of velocity: rounding.
+# Difference of the end of a step from the recorded one, as shares of its change of velocity and of its speed: rounding.
 _SAME, _OF_SPEED = 1e-5, 1e-8
 
 logger = logging.getLogger(__name__)
@@ -146,8 +146,8 @@ def linearize_steps(
         # One product instead of many small ones.
         B = Jf if scene.direct else (Jf.reshape(-1, Jf.shape[2]) @ scene.transmission).reshape(steps, 2 * n, m)
         F, G, Gx, Gu = (np.zeros((steps, *shape)) for shape in ((n, 0), (2 * n, 0), (2 * n, 0, 2 * n), (2 * n, 0, m)))
-        slopes = ramp, None if ramp is None else Gu
-        return Linearization(Jx, B, K, Jk, F, G, Gx, Gu, trajectory.dt, integrator.variational, *slopes)
+        Gramp = None if ramp is None else Gu
+        return Linearization(Jx, B, K, Jk, F, G, Gx, Gu, trajectory.dt, integrator.variational, ramp, Gramp)
     start = noise_fields(scene, trajectory, q[:-1], v[:-1], first)
     A, B = Jx, Jf @ scene.transmission
     if start.Fv is not None:

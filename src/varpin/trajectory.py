@@ -242,19 +242,21 @@ class Trajectory(Frozen):
         return made
 
     def __post_init__(self) -> None:
-        """Check shapes; arrays that are left out have no columns."""
-        N, n = np.size(self.t) - 1, len(self.joint_names)
+        """Check shapes, on which readers rely; arrays that are left out have no columns."""
+        N, n = max(np.size(self.t) - 1, 0), len(self.joint_names)
         m, k = (np.shape(array)[1] if np.ndim(array) == 2 else 0 for array in (self.u, self.dw))
-        shapes: dict[str, Any] = {"t": (N + 1,), "energy": (N + 1,), "u": (N, m), "dw": (N, k)}
-        shapes |= dict.fromkeys("qvp", (N + 1, n))
+        left_out = {"constraint_forces": (N, len(self.constraint_labels)), "u_stages": (N, 0, m), "u_nodes": (N + 1, 0)}
+        for name, shape in left_out.items():
+            if not np.size(getattr(self, name)):
+                object.__setattr__(self, name, np.zeros(shape))
+        shapes: dict[str, Any] = {"t": (N + 1,), "energy": (N + 1,), "u": (N, m), "dw": (N, k)} | left_out
+        shapes |= dict.fromkeys("qvp" if self.error is None else ("q", "v", "p", "error"), (N + 1, n))
+        shapes |= {"u_stages": (N, *np.shape(self.u_stages)[1:2], m)}
+        shapes |= {"u_nodes": (N + 1, m)} if np.size(self.u_nodes) else {}
         for name, shape in shapes.items():
             array = getattr(self, name)
             if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
                 raise InputError(f"a trajectory's {name} must be a float64 array {shape}, got {reprlib.repr(array)}")
-        left_out = {"constraint_forces": (N, len(self.constraint_labels)), "u_stages": (N, 0, m), "u_nodes": (N + 1, 0)}
-        for name, shape in left_out.items():
-            if not getattr(self, name).size:
-                object.__setattr__(self, name, np.zeros(shape))
         _sealed(self.statistics)
         _sealed(self)
 
@@ -402,5 +404,9 @@ def require_trajectory(motion: object) -> Trajectory:
 
 def kinematic_input_rows(trajectory: Trajectory) -> Floats:
     """Rows (joint, joint, rate, ...) of a record's ties that are kinematic inputs: joints tied to themselves."""
-    ties = trajectory.scene_values.get("constraints.ties", np.zeros((0, 3)))
+    none = np.zeros((0, 3))
+    ties = trajectory.scene_values.get("constraints.ties", none)
+    # A file may have other shapes.
+    if ties.ndim != 2 or ties.shape[1] < 3:
+        return none
     return np.asarray(ties[ties[:, 0] == ties[:, 1]], dtype=np.float64)

@@ -78,6 +78,17 @@ ELEMENTS = {"Armature": Kind(1, False, False)} | {name: Kind(*facts) for name, f
 COUPLINGS = {name: Kind(*facts) for name, facts in coupling_kinds().items()}
 
 
+def bound_force(force: Force, robot: Robot) -> tuple[Element | Coupling, ...]:
+    """``force.bind(robot)``; what else than numbers of the core the ``bind`` of a user returns is refused here."""
+    parts = tuple(force.bind(robot))
+    for part in parts:
+        if not isinstance(part, Element | Coupling) or np.isnan(as_floats("values", part.values)).any():
+            raise InputError(
+                f"{type(force).__name__}.bind returned {part!r}: it must be an Element or a Coupling without NaN"
+            )
+    return parts
+
+
 def kept(name: str, value: Any) -> Any:
     """An immutable copy of a parameter."""
     if value is None or isinstance(value, str) or callable(value):
@@ -120,7 +131,8 @@ class JointForce(Force):
 
     def bind(self, robot: Robot) -> tuple[Element, ...]:
         numbers: dict[str, Floats] = {}
-        for name in (item.name for item in fields(self) if not getattr(self, item.name) is item.default is None):
+        given = (item for item in fields(self) if item.default is not None or getattr(self, item.name) is not None)
+        for name in (item.name for item in given):
             none = _LIMITS.get(name, 0.0)
             values = joint_array(name, getattr(self, name), robot.joint_names, uniform=True, absent=none)
             if name in _LIMITS:

@@ -331,13 +331,24 @@ def models_of(noise: Noise | Sequence[Noise] | None) -> tuple[Noise, ...]:
 
 
 def bind(models: Sequence[Noise], actuation: Floats, joints: Sequence[str]) -> BoundNoise:
-    """Noise models on a robot with this actuation matrix (n, m) and these joints.
+    """Noise models on a robot with this actuation matrix (n, m) and these joints; those of users are checked here.
 
     Raises:
         UnknownJoint: A model names a joint that is not in ``joints``.
-        InputError: Parameters do not fit the robot.
+        InputError: Parameters do not fit the robot, or ``bind`` of a model returned arrays that do not.
     """
-    parts = [_noise(len(actuation), actuation.shape[1], 0), *(model.bind(actuation, joints) for model in models)]
+    n, m = actuation.shape
+    parts = [_noise(n, m, 0), *(model.bind(actuation, joints) for model in models)]
+    for name, part in zip((type(model).__name__ for model in models), parts[1:], strict=True):
+        if not isinstance(part, BoundNoise):
+            raise InputError(f"bind of {name} must return a BoundNoise, got {type(part).__name__}")
+        k = part.processes
+        for field, array, shape in zip(
+            Diffusion._fields, part.arrays, ((n, k), (n, k, m), (n, k), (n, k)), strict=True
+        ):
+            # NaN in a center means the initial configuration.
+            known = np.nan_to_num(array, posinf=np.inf, neginf=-np.inf) if field == "center" else array
+            finite_array(f"{field} of {name}", known, shape)
     firsts = np.cumsum([0, *(part.processes for part in parts)]).tolist()
     own = [(first + k, noise) for first, part in zip(firsts, parts, strict=False) for k, noise in part.own]
     columns = zip(*(part.arrays for part in parts), strict=True)

@@ -37,6 +37,7 @@ from varpin.mechanics.forces import (
     JointDamper,
     JointSpring,
     JointStop,
+    bound_force,
     dissipates,
     keeps_energy,
     of_kind,
@@ -763,7 +764,7 @@ def _forces(
     refuse_where("friction", dry, dry < 0.0, "must be >= 0")
     short: tuple[Force, ...] = (JointSpring(stiffness, rest), JointDamper(viscous), CoulombFriction(dry))
     acting = [(force, parts) for force in short if (parts := force.bind(robot))]
-    acting += [(force, force.bind(robot)) for force in given]
+    acting += [(force, bound_force(force, robot)) for force in given]
     given = tuple(force for force, _ in acting)
     bound = [each for _, parts in acting for each in parts]
     elements = [each for each in bound if isinstance(each, Element)]

@@ -169,10 +169,10 @@ def with_mesh_inertias(robot: Robot, density: float) -> Robot:
         raise InputError(f"inertia='meshes' needs a URDF file; {robot.name!r} does not come from one")
     urdf = read_urdf(robot.urdf, robot.expanded)
     known = {inertial.link for inertial in robot.inertials}
-    shapes, faults = build_shapes(urdf, robot.package_dirs)
-    for link, fault in faults.items():
+    shapes, unread = build_shapes(urdf, robot.package_dirs)
+    for link, what in unread.items():
         if link not in known:
-            raise RobotError(fault)
+            raise RobotError(what)
     model, index = robot.model.copy(), joint_index(robot.model)
     masses: dict[str, float] = {}
     for shape in shapes.geometryObjects:

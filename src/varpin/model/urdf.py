@@ -117,8 +117,7 @@ def _model(root: ET.Element, path: Path) -> tuple[pin.Model, tuple[Inertial, ...
         if part.tag in ("link", "joint"):
             kept = ET.SubElement(small, part.tag, part.attrib)
             kept.extend(part if part.tag == "joint" else part.findall("inertial"))
-    text = ET.tostring(small, encoding="unicode")
-    model, complaint = _built(text)
+    model, complaint = _built(small)
     expand = "${" in complaint or "$(" in complaint or (model is None and bool(_xacro(root)))
     complaint = textwrap.shorten(complaint, _COMPLAINT)
     if re.search(r"\d,\d", complaint):
@@ -131,8 +130,12 @@ def _model(root: ET.Element, path: Path) -> tuple[pin.Model, tuple[Inertial, ...
     bodies = {frame.name for frame in model.frames if frame.type == pin.FrameType.BODY}
     if lost := [repr(link.get("name")) for link in root.findall("link") if link.get("name") not in bodies]:
         raise RobotError(f"{path}: links {listed(lost, 'links')} are on a loop of joints without a root")
-    # Pinocchio merges links on fixed joints into one body: with joints that move, each link is one.
-    apart = _built(text.replace(' type="fixed"', ' type="continuous"'))[0]
+    # Pinocchio merges links on fixed joints into one body: with joints that move, each link is one. Of fixed joints it
+    # reads no axes.
+    for joint in small.iterfind("joint[@type='fixed']"):
+        joint.set("type", "continuous")
+        joint[:] = [part for part in joint if part.tag != "axis"]
+    apart = _built(small)[0]
     given = {link.get("name", "") for link in root.findall("link[inertial]")}
     found = []
     for frame in apart.frames:
@@ -142,11 +145,11 @@ def _model(root: ET.Element, path: Path) -> tuple[pin.Model, tuple[Inertial, ...
     return model, tuple(found), complaint
 
 
-def _built(text: str) -> tuple[Any, str]:
+def _built(root: ET.Element) -> tuple[Any, str]:
     """Pinocchio's model of a URDF, None if it has none, and its complaints."""
     with captured_stderr() as complaints:
         try:
-            return pin.buildModelFromXML(text), "; ".join(complaints())
+            return pin.buildModelFromXML(ET.tostring(root, encoding="unicode")), "; ".join(complaints())
         except (ValueError, RuntimeError, IndexError) as error:
             return None, "; ".join(complaints()) or str(error)
 
