@@ -195,6 +195,14 @@ class Mpc:
         if self.budget != np.inf:
             positive("budget", self.budget, "s")
 
+    def _repr_html_(self) -> str:
+        rows = [
+            ("period", f"{1e3 * self.period:.3g} ms"),
+            ("iterations", f"{self.iterations} a tick"),
+            ("budget", "any time" if self.budget == np.inf else f"{1e3 * self.budget:.3g} ms"),
+        ]
+        return facts("Model predictive control", rows, self.problem._repr_html_())
+
     @property
     def period(self) -> float:
         """Time of a tick: how long a decision is held, or the line between two decisions lasts [s]."""
