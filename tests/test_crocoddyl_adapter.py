@@ -65,6 +65,20 @@ def test_steps_and_their_derivatives(name):
     np.testing.assert_allclose(gradient, numeric[12], rtol=0, atol=1e-7 * np.abs(gradient).max())
 
 
+@pytest.mark.parametrize("sampling", ["midpoint", "gauss"])
+def test_references_at_the_nodes_of_the_horizon(sampling):
+    """Each step has those of its place, also where the horizon does not begin at time 0."""
+    line, robot = np.linspace([0.0, 0.0], [1.0, 0.5], 6), vp.planar_chain(2)
+    cost = vp.TrackingCost(line, 3.0) + vp.ControlCost(1.0, reference=line[1:]) + vp.TrackingCost(lambda t: [t, 0.0])
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot), cost + vp.Terminal(vp.TrackingCost(line)), [0, 0], [0, 0], dt=0.05, steps=5, t0=0.7,
+        sampling=sampling,
+    )  # fmt: skip
+    motion = vp.solve(problem, max_iterations=0, check=False).trajectory
+    found = shooting_problem(problem).calc(*first_guess(problem))
+    assert found == pytest.approx(problem.cost_of(motion), rel=1e-10)
+
+
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_fddp_finds_the_same_optimum(name):
     """Its solution goes on as one of varpin's."""

@@ -127,6 +127,25 @@ def test_a_plant_that_fails_keeps_the_motion():
     assert caught.value.trajectory.dt == pytest.approx(0.02)
 
 
+def test_a_run_that_ends_early_tells_of_ticks_without_a_plan():
+    """In the warnings of the motion that its error holds: the plant falls out of step, or Ctrl-C."""
+
+    def stop(done, _):
+        if done == 5:
+            raise KeyboardInterrupt
+
+    link = vp.planar_chain(1)
+    problem = vp.OptimalControlProblem(vp.Scene(link), vp.ControlCost(), [0.0], [0.0], dt=0.05, steps=4)
+    for pull, kind in ((100.0, vp.StepFailure), (9.81, vp.Interrupted)):
+        fails = vp.Midpoint(guard=vp.Guard(max_halvings=0))
+        with pytest.raises(kind) as caught:
+            vp.Mpc(problem, budget=1e-9).run(
+                vp.Plant(vp.Scene(link, gravity=(0.0, 0.0, -pull)), fails, 1), duration=1.0, progress=stop
+            )
+        assert about(caught.value.trajectory.warnings, "late plans")
+        assert bool(about(caught.value.trajectory.warnings, "plan at its end")) == (kind is vp.Interrupted)
+
+
 @pytest.mark.parametrize("controls", ["held", "linear"])
 def test_a_plan_that_has_no_successor_acts_to_its_end_and_is_held_there(controls):
     """With the feedback of its last decision, or on its last state; the run tells from when on."""

@@ -102,6 +102,7 @@ def objects(robot):
         "plan": plan,
         "verification": plan.verify(),
         "monte carlo": plan.monte_carlo(paths=8, rng=0),
+        "mpc": vp.Mpc(problem),
         "run": run,
         "file": vp.load_scene("allegro_finger"),
         "required": vp.load_scene("allegro_finger").required,
@@ -115,7 +116,7 @@ def test_no_name_becomes_markup(objects):
     shown = {name: thing._repr_html_() for name, thing in objects.items() if hasattr(thing, "_repr_html_")}
     for text in shown.values():
         Reader(text)
-    for name in ("robot", "scene", "motion", "report", "plan"):
+    for name in ("robot", "scene", "motion", "mpc", "report", "plan"):
         assert "a<i>rm" in Reader(shown[name]).text
     for name in ("robot", "scene", "motion", "report"):
         for joint in NAMES:

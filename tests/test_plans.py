@@ -175,6 +175,18 @@ def test_what_cannot_be_is_said_first(options, kind, times, caplog):
     assert not times or (told[0].kind == kind and told[0] in caplog.messages[0])
 
 
+def test_a_constraint_of_ones_own_may_have_any_attributes():
+    """Those of the library's constraints have lengths that may look like millimetres."""
+
+    class Own(vp.PlanConstraint):
+        radius, offset, obstacles, center = np.array([500.0, 600.0]), "none", ("a", "b"), np.zeros(2)
+
+        def bind(self, horizon):
+            return vp.WithinJointLimits(horizon.robot, (-3.0, 3.0)).bind(horizon)
+
+    assert vp.solve(small(constraints=Own()), max_iterations=0).warnings == ()
+
+
 def held(plan):
     """Whether what the robot pays is what was planned."""
     truth = plan.verify(tolerance=1e-6, max_substeps=256)

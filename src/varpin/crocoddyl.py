@@ -147,9 +147,9 @@ def shooting_problem(problem: OptimalControlProblem) -> crocoddyl.ShootingProble
         raise InputError(f"crocoddyl decides at every step; the problem holds its controls over {problem.hold}")
     if problem.constraints:
         raise InputError("hard constraints of a plan have no counterpart in crocoddyl: make them costs")
-    q, v, one = problem.q0, problem.v0, problem.at(steps=1, integrator=problem.integrator)
+    q, v = problem.q0, problem.v0
     x0 = np.concatenate([q, lagrangian_jet(problem.scene, q, v).Lv if problem.integrator.variational else v])
-    models = [StepModel(one.at(t0=problem.t0 + k * problem.dt)) for k in range(problem.steps)]
+    models = [StepModel(problem.step(k)) for k in range(problem.steps)]
     return crocoddyl.ShootingProblem(x0, models, EndModel(problem))
 
 

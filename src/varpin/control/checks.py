@@ -14,6 +14,10 @@ from varpin.arrays import Floats
 from varpin.control.constraints import (
     KeepClear,
     KeepInBox,
+    KeepInHalfSpace,
+    KeepInSphere,
+    KeepOutOfSphere,
+    PlanConstraint,
     ReachFrame,
     WithinJointLimits,
 )
@@ -248,20 +252,26 @@ def _in_millimetres(problem: OptimalControlProblem) -> Iterator[Finding]:
             yield Finding("places in millimetres", sentence)
 
 
-def _lengths(constraint: Any) -> dict[str, float]:
+def _lengths(constraint: PlanConstraint) -> dict[str, float]:
     """Names of a constraint's lengths, and their sizes [m]; places count by their distance from the robot's root."""
-    found = {name: abs(getattr(constraint, name)) for name in ("radius", "offset") if hasattr(constraint, name)}
-    if isinstance(center := getattr(constraint, "center", None), np.ndarray):
-        found["the distance of its centre"] = float(np.linalg.norm(center - constraint.robot.tree.translation[0]))
-    if isinstance(constraint, KeepInBox):
+    found: dict[str, float] = {}
+    if isinstance(constraint, KeepInSphere | KeepOutOfSphere):
+        found["radius"] = constraint.radius
+        if not callable(constraint.center):
+            root = constraint.robot.tree.translation[0]
+            found["the distance of its centre"] = float(np.linalg.norm(constraint.center - root))
+    elif isinstance(constraint, KeepInHalfSpace):
+        found["offset"] = abs(constraint.offset)
+    elif isinstance(constraint, KeepInBox):
         # One far side may stand for none.
-        sides = np.abs(constraint.limits[np.isfinite(constraint.limits)])
-        found["its nearest side"] = float(sides[sides > 0.0].min(initial=np.inf)) if sides.any() else 0.0
-    for body in getattr(constraint, "obstacles", ()):
-        ends, sides = np.array([body.begin, body.end]), body.sides if body.hull is None else body.hull.sides
-        away = np.linalg.norm(ends - constraint.robot.tree.translation[0], axis=1)
-        found[f"the obstacle {body.name!r}: its distance"] = float(away.min())
-        found[f"the obstacle {body.name!r}: its radius or side"] = body.radius if sides is None else sides.max()
+        away = np.abs(constraint.limits[np.isfinite(constraint.limits)])
+        found["its nearest side"] = float(away[away > 0.0].min(initial=np.inf)) if away.any() else 0.0
+    elif isinstance(constraint, KeepClear):
+        for body in constraint.obstacles:
+            ends, sides = np.array([body.begin, body.end]), body.sides if body.hull is None else body.hull.sides
+            distances = np.linalg.norm(ends - constraint.robot.tree.translation[0], axis=1)
+            found[f"the obstacle {body.name!r}: its distance"] = float(distances.min())
+            found[f"the obstacle {body.name!r}: its radius or side"] = body.radius if sides is None else sides.max()
     return found
 
 

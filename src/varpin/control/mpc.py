@@ -30,7 +30,8 @@ from varpin.mechanics.wiener import generator
 from varpin.signals.commands import in_parts_of_steps, with_ends
 from varpin.simulation.check import check
 from varpin.simulation.choice import usual_integrator
-from varpin.simulation.failures import StepFailure
+from varpin.simulation.failures import Interrupted, StepFailure
+from varpin.simulation.limits import beyond_limits
 from varpin.simulation.loop import unstable_loop
 from varpin.simulation.record import Progress
 from varpin.simulation.simulate import noise_forgotten, simulate
@@ -195,6 +196,14 @@ class Mpc:
         if self.budget != np.inf:
             positive("budget", self.budget, "s")
 
+    def _repr_html_(self) -> str:
+        rows = [
+            ("period", f"{1e3 * self.period:.3g} ms"),
+            ("iterations", f"{self.iterations} a tick"),
+            ("budget", "any time" if self.budget == np.inf else f"{1e3 * self.budget:.3g} ms"),
+        ]
+        return facts("Model predictive control", rows, self.problem._repr_html_())
+
     @property
     def period(self) -> float:
         """Time of a tick: how long a decision is held, or the line between two decisions lasts [s]."""
@@ -301,8 +310,11 @@ class Mpc:
         except ControlError as error:
             cause = error.__cause__
             if isinstance(cause, CostError):
-                raise CostError(cause.cost, cause.problem, error.trajectory) from cause
+                raise CostError(cause.cost, cause.problem, loop.told(error.trajectory)) from cause
             raise cause or error from None
+        except (StepFailure, Interrupted) as error:
+            error.trajectory = loop.told(error.trajectory)
+            raise
         loop.report(motion.t[-1], motion.q[-1], motion.v[-1])
         # The controller corrects the errors of a tick in the next.
         motion = check(scene, method, motion.changed(warnings=()), restart=plant.substeps)
@@ -405,6 +417,10 @@ class _Loop:
         if self.problem.linear and before is not None:
             share = (np.arange(substeps)[:, None] + 0.5) / substeps
             self.rows = with_ends(scene, before + share * (self.applied - before), self.rows)
+
+    def told(self, motion: Trajectory) -> Trajectory:
+        """The plant's motion up to where it ended early, with its warnings and those of ticks without a plan."""
+        return motion.changed(warnings=(*beyond_limits(self.plant.scene, motion), *self.without_plans()))
 
     def without_plans(self) -> list[Finding]:
         """Warnings if more than a few plans took longer than the budget or the period, or searches found no plan."""

@@ -359,6 +359,10 @@ class OptimalControlProblem(Frozen):
         given = {"dt": self.dt / parts, "steps": self.steps * parts, "hold": self.hold * parts, "sampling": "gauss"}
         return self.changed(**given)._bind(self.running.points)
 
+    def step(self, k: int) -> OptimalControlProblem:
+        """Step ``k`` of the problem alone; references have their values there, also those given at all nodes."""
+        return self.changed(steps=1, t0=self.t0 + k * self.dt)._bind(self.running.points)
+
     @cached_property
     def setting(self) -> dict[str, Any]:
         """What tells the problem from others, costs aside: numbers and texts by name; noise in Python by its size.

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from varpin.control import OptimalControlProblem, Solution, solve
+from varpin.control.problem import require_problem
 from varpin.errors import InputError
 from varpin.integrators import Integrator
 from varpin.study.motion import fastest, integrators_of
@@ -120,8 +121,7 @@ def optimal_control_tradeoff(
         InputError: Wrong arguments.
         StudyInterrupted: Ctrl-C; holds the runs so far. It is a KeyboardInterrupt.
     """
-    if not isinstance(problem, OptimalControlProblem):
-        raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
+    require_problem(problem)
     members, repeats = integrators_of(problem.scene, integrators), count("repeats", repeats, least=1)
     steps = (2.0 * problem.dt, problem.dt, 0.5 * problem.dt) if dts is None else tuple(dts)
     jobs = [_discretized(problem, member, dt, period) for member in members for dt in sorted(steps, reverse=True)]
