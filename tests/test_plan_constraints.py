@@ -42,6 +42,29 @@ FAMILIES = {
 }
 
 
+@pytest.mark.parametrize("torque", [1e-15, 1e-6, 1e-3])
+def test_a_first_motion_that_costs_next_to_nothing_does_not_call_a_goal_infeasible(torque):
+    """The plan is that of the same cost without the small reference, whose first motion costs nothing."""
+
+    def plan(reference):
+        cost = vp.ControlCost(0.1, reference=[reference, 0.0]) + vp.VelocityCost(0.02)
+        problem = vp.OptimalControlProblem(
+            vp.Scene(ROBOT, gravity=False, damping=0.1),
+            cost + vp.Terminal(vp.VelocityCost(10.0)),
+            [0.0, 0.1],
+            [0.0, 0.0],
+            dt=0.05,
+            steps=24,
+            constraints=[vp.ReachFrame(ROBOT, "tip", position=ROBOT.frame_positions([1.0, 0.5], "tip"))],
+        )
+        return vp.solve(problem, check=False)
+
+    found, exact = plan(torque), plan(0.0)
+    assert found.status is vp.Status.CONVERGED, found.reason
+    assert found.violation <= 1e-6
+    assert found.cost == pytest.approx(exact.cost, rel=1e-3)
+
+
 def test_centres_that_move_are_compared_by_where_they_are():
     """In another process the same function has another address."""
 

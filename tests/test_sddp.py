@@ -220,6 +220,15 @@ def arm_controls(problem, seed=3):
     return base + 0.3 * np.abs(base).max() * np.random.default_rng(seed).normal(size=shape)
 
 
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_rest_costs_no_velocities(sampling):
+    """Not even those of rounding: a search weighs constraints by what is at stake."""
+    at = np.random.default_rng(0).normal(size=4)
+    given = {"q0": at, "v0": np.zeros(4), "dt": 0.03, "steps": 20, "sampling": sampling}
+    problem = vp.OptimalControlProblem(vp.Scene(vp.planar_chain(4)), vp.VelocityCost(1.0), **given)
+    assert problem.costs(np.tile(at, (21, 1)), np.zeros((21, 4)), np.zeros((20, 4))) == 0.0
+
+
 @pytest.mark.parametrize("hold", [1, 3])
 @pytest.mark.parametrize("sampling", SAMPLINGS)
 @pytest.mark.parametrize("integrator", GRADIENT_INTEGRATORS, ids=str)

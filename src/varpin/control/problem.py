@@ -524,11 +524,12 @@ class OptimalControlProblem(Frozen):
         (..., N + 1, m) at the nodes where controls are linear between them.
         """
         shape = *q.shape[:-2], (q.shape[-2] - 1) * len(self.rule), q.shape[-1]
-        nodes, weights = (q[..., :-1, :], v[..., :-1, :], q[..., 1:, :], v[..., 1:, :]), self.rule[:, 1:].reshape(-1, 4)
+        # Beside the first node: what cancels at rest leaves no velocities by rounding.
+        moves, weights = (v[..., :-1, :], np.diff(q, axis=-2), v[..., 1:, :]), self.rule[:, 1:].reshape(-1, 4)[:, 1:]
         # A node without weight may be NaN.
         used = np.flatnonzero(weights.any(axis=0))
-        at = weights[:, used] @ np.stack([nodes[i] for i in used], -2)
-        at_q, at_v = at[..., ::2, :].reshape(shape), at[..., 1::2, :].reshape(shape)
+        at = weights[:, used] @ np.stack([moves[i] for i in used], -2)
+        at_q, at_v = (at[..., ::2, :] + q[..., :-1, None, :]).reshape(shape), at[..., 1::2, :].reshape(shape)
         if self.linear:
             share = self.places[:, None]
             between = (1.0 - share) * u[..., :-1, None, :] + share * u[..., 1:, None, :]

@@ -19,6 +19,8 @@ from varpin.control.stages import Rows, Stages
 # Residuals at which the solver stops, absolute for a cost of gradient one and relative, and those of a solution that it
 # cannot improve further, as weights are far apart.
 _ABSOLUTE, _RELATIVE, _ROUNDED = 1e-10, 1e-11, 1e-7
+# Change of controls, in their own units, that is rounding: a first motion may cost nothing but for it.
+LEAST = 1e-12
 # Greatest number of interior-point steps; solved programs take 10 to 40.
 _STEPS = 60
 # Weight of the squares of slacks, relative to their linear cost: it makes them unique.
@@ -67,7 +69,8 @@ class Program:
         self.stiffness = float(diagonal.max())
         gradient = -(pull @ plan.feedforward[:, :, None])[:, :, 0]
         # The scale of the cost, to which the solver's residuals are relative.
-        self._scale = float(np.abs(gradient).max()) or float(np.abs(hessian).max()) or 1.0
+        slope, bend = float(np.abs(gradient).max()), float(np.abs(hessian).max())
+        self._scale = (slope if slope > LEAST * bend else bend) or 1.0
         self._gradient = np.zeros(layout.size)
         np.add.at(self._gradient, at[at >= 0], gradient[at >= 0] / self._scale)
         self._lower, self._upper = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)

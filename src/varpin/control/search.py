@@ -25,7 +25,7 @@ from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.line_search import Taken, Trial, line_search
 from varpin.control.multipliers import FEASIBLE, Multipliers, flat, split
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.qp import Minimum, Program, changes
+from varpin.control.qp import LEAST, Minimum, Program, changes
 from varpin.control.riccati import Plan, backward, foreseen, noise_shares
 from varpin.control.rollout import around
 from varpin.control.second_order import curvature_along
@@ -340,7 +340,8 @@ class Search:
         found = program.minimum(values)
         needed = np.inf if found is None else _ABOVE * _largest(found.multipliers)
         # Rows that cost far more than what is at stake are approached step by step.
-        dear = max(self.weight, _HEAVY * (max(abs(self.cost), self.first) or program.stiffness))
+        stake = max(abs(self.cost), self.first)
+        dear = max(self.weight, _HEAVY * (stake if stake > LEAST**2 * program.stiffness else program.stiffness))
         elastic = bool(rows) and needed > dear
         if elastic:
             missed = program.minimum(values, weight=dear)
