@@ -58,7 +58,10 @@ class BoundBetween(BoundConstraint):
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """See :meth:`BoundConstraint.value`; for one motion. Infinite where a step fails in parts."""
-        return self.inner.value(*self._states(q, v), u) if self.ends is None else self._in_parts(self._given(q, v, u))
+        if self.ends is None:
+            return self.inner.value(*self._states(q, v), u)
+        (found,) = self._in_parts(self._given(q, v, u)[None])
+        return found
 
     def _given(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """The state before each step and its controls (K, 2n + c)."""
@@ -66,14 +69,16 @@ class BoundBetween(BoundConstraint):
         return np.concatenate([q[begin], v[begin], _controls(self.problem, u, begin)], axis=1)
 
     def _in_parts(self, given: Floats) -> Floats:
+        """Values (S, K, rows) for states before the steps and their controls (S, K, 2n + c); infinite if one fails."""
         assert self.ends is not None
-        _, first, index = np.unique(self.places, return_index=True, return_inverse=True)
-        parts = _in_parts(self.problem, given[first])
+        (_, first, index), S = np.unique(self.places, return_index=True, return_inverse=True), len(given)
+        parts = _in_parts(self.problem, given[:, first].reshape(-1, given.shape[2]))
         if parts is None:
-            return np.full(self.shape, np.inf)
-        within_q, within_v = (_after_first(x[index].reshape(-1, x.shape[2])) for x in parts)
-        found = self.ends.value(within_q, within_v, np.zeros((len(within_q), 0)))
-        return _on_parabolas(found.reshape(len(self.places), -1, len(self.rows)), self.moments)
+            return np.full((S, *self.shape), np.inf)
+        steps = (x.reshape(S, len(first), *x.shape[1:])[:, index] for x in parts)
+        within_q, within_v = (_after_first(x.reshape(S, -1, x.shape[3])) for x in steps)
+        found = self.ends.value(within_q, within_v, np.zeros((*within_q.shape[:2], 0)))
+        return _on_parabolas(found.reshape(S, len(self.places), -1, len(self.rows)), self.moments)
 
     def slopes(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """Derivatives (K, rows, 2n + c) in the states where the steps begin and in their controls, by differences.
@@ -81,12 +86,12 @@ class BoundBetween(BoundConstraint):
         Raises:
             LinearizationError: A step fails in parts.
         """
-        z = self._given(q, v, u)
-        here, shifts = self._in_parts(z), _SHIFT * np.eye(z.shape[1])
-        with np.errstate(invalid="ignore"):
-            found: Floats = np.stack([self._in_parts(z + shift) - here for shift in shifts], axis=2) / _SHIFT
-        if not np.isfinite(found).all():
+        given = self._given(q, v, u)
+        shifts = _SHIFT * np.eye(given.shape[1] + 1, given.shape[1], -1)
+        values = self._in_parts(given + shifts[:, None])
+        if not np.isfinite(values).all():
             raise LinearizationError(0, 0.0, "a step fails in parts")
+        found: Floats = np.moveaxis(values[1:] - values[0], 0, 2) / _SHIFT
         return found
 
     @property
@@ -245,8 +250,8 @@ def _in_parts(problem: OptimalControlProblem, given: Floats) -> tuple[Floats, Fl
 
 
 def _after_first(x: Floats) -> Floats:
-    """Nodes (1 + K, n) that end with the states (K, n)."""
-    return np.concatenate([x[:1], x])
+    """Nodes (..., 1 + K, n) that end with the states (..., K, n)."""
+    return np.concatenate([x[..., :1, :], x], axis=-2)
 
 
 def _seen(problem: OptimalControlProblem, motion: Trajectory) -> dict[int, Floats]:
@@ -270,9 +275,9 @@ def _seen(problem: OptimalControlProblem, motion: Trajectory) -> dict[int, Float
 
 
 def _on_parabolas(near: Floats, moments: Floats) -> Floats:
-    """Values (K, rows) at moments (K,) of steps from those at the ends of their parts (K, parts + 1, rows)."""
+    """Values (S, K, rows) at moments (K,) of steps from those at the ends of their parts (S, K, parts + 1, rows)."""
     middle = np.clip(np.rint(_PARTS * moments), 1, _PARTS - 1).astype(np.int64)
-    before, here, after = (near[np.arange(len(near)), middle + k] for k in (-1, 0, 1))
+    before, here, after = (near[:, np.arange(len(moments)), middle + k] for k in (-1, 0, 1))
     x = (_PARTS * moments - middle)[:, None]
     found: Floats = here + 0.5 * x * (after - before) + 0.5 * x**2 * (after - 2.0 * here + before)
     return found
