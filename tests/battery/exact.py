@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from battery.trial import Setup
 from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene
+from varpin.simulation.spectrum import speed_scales, travel_scales
 from varpin.study import exact
 from varpin.study.checks import LEVELS
 from varpin.study.exact import DISTURBANCE, NODES, Exact, before_step, grown, in_units, nodes_of, path
@@ -45,13 +46,12 @@ def exact_motion(setup: Setup, dt: float, steps: int, window: float, *, left: fl
 def period_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> float:
     """The largest error from any of some nodes on, in units of what is wrong; NaN where none is known.
 
-    Errors are shares of the joint's travel and largest speed over the whole motion, as far as a small disturbance does
-    not grow out of hand.
+    Errors are shares of the scales by which motions are told of, as far as a small disturbance does not grow out of
+    hand, and of velocities the smaller of two successive ones, as a small shift in time changes a peak by much.
     """
     if not trajectory.steps or scene.noise.diffusion is None or not np.abs(trajectory.v).max() > 0.0:
         return math.nan
-    q, v, whole = trajectory.q, trajectory.v, np.arange(trajectory.steps + 1)
-    units = in_units(scene, q[0], v[0], trajectory.dt, whole, q, v)
+    units = travel_scales(scene, trajectory.q), speed_scales(scene, trajectory.v)
     worst, end = math.nan, time.process_time() + _PATIENCE_PERIODS
     for step in np.unique(np.linspace(0, max(0, trajectory.steps - _STEPS), _BEGINS).astype(np.int64)).tolist():
         worst = np.fmax(worst, _error_from(scene, integrator, trajectory, step, units))
@@ -60,7 +60,9 @@ def period_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     return float(worst)
 
 
-def _error_from(scene: Scene, integrator: Integrator, trajectory: Trajectory, step: int, units: Exact) -> float:
+def _error_from(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, step: int, units: tuple[Floats, Floats]
+) -> float:
     """The error from one node on; NaN where the exact motion ends before."""
     n, ahead = scene.robot.dof, slice(step, step + min(_STEPS, trajectory.steps - step))
     u, dw, begin = trajectory.u[ahead], trajectory.dw[ahead], (trajectory.q[step], trajectory.v[step])
@@ -73,6 +75,6 @@ def _error_from(scene: Scene, integrator: Integrator, trajectory: Trajectory, st
         return math.nan
     nodes, plain = slice(step, step + known + 1), plain[: known + 1]
     with np.errstate(over="ignore", invalid="ignore"):
-        q = np.abs(plain[:, :n] - trajectory.q[nodes]) / units.travels / LEVELS["error"]
-        v = np.abs(plain[:, n:] - trajectory.v[nodes]) / units.speeds / LEVELS["velocity"]
-    return float(max(q.max(), v.max()))
+        q = np.abs(plain[:, :n] - trajectory.q[nodes]) / units[0] / LEVELS["error"]
+        v = np.abs(plain[:, n:] - trajectory.v[nodes]) / units[1] / LEVELS["velocity"]
+    return float(max(q.max(), np.minimum(v[:-1], v[1:]).max()))

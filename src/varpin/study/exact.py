@@ -19,7 +19,7 @@ from varpin.core import ForwardDynamics
 from varpin.integrators import Integrator
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.simulation.spectrum import largest_of_its_kind, masses
+from varpin.simulation.spectrum import largest_of_its_kind, masses, speed_scales
 from varpin.trajectory import Trajectory
 
 _TOLERANCE = 1e-11
@@ -31,8 +31,8 @@ SHORTEST = 1e-6
 PATIENCE = 3.0
 # Growth of a disturbance from which on a motion counts as unpredictable; and the disturbance, relative to q.
 _PREDICTABLE, DISTURBANCE = 10.0, 1e-7
-# For a joint that hardly moves, the unit of errors is at least the smaller of two: this share of the largest travel or
-# speed among joints of its kind, and of the speed at which the joint would have their energy.
+# For a joint that hardly moves, the unit of travels is at least the smaller of two: this share of the largest among
+# joints of its kind, and of the way at the speed at which the joint would have their energy.
 _LITTLE, _LIGHT = 1e-2, 1e-2
 # Least change of a speed, as a share of it, for joints at constant speed.
 _EVEN = 1e-3
@@ -55,16 +55,18 @@ class Exact:
         """Largest distances of a motion, none if it ends before the first node.
 
         ``error`` in q, in units of the travel; ``joint`` in q and ``velocity`` in v, each joint in units of its own
-        travel and velocity, so that a far or fast joint does not hide the others.
+        travel and velocity, so that a far or fast joint does not hide the others. Of velocities at successive nodes the
+        smaller error counts: one that lasts for a step is of a jump that comes late.
         """
         nodes = self.nodes[self.nodes <= trajectory.steps]
         if not len(nodes):
             return {}
         q, v = (np.abs(a[nodes] - b[: len(nodes)]) for a, b in ((trajectory.q, self.q), (trajectory.v, self.v)))
+        lasting = np.where(np.diff(nodes, append=0)[:, None] == 1, np.minimum(v, np.roll(v, -1, axis=0)), v)
         return {
             "error": float(q.max() / self.travel),
             "joint": float((q / self.travels).max()),
-            "velocity": float((v / self.speeds).max()),
+            "velocity": float((lasting / self.speeds).max()),
         }
 
 
@@ -186,17 +188,16 @@ def _integrated(
 
 
 def in_units(scene: Scene, q0: Floats, v0: Floats, dt: float, nodes: NDArray[np.int64], q: Floats, v: Floats) -> Exact:
-    """An exact motion with travels and speeds: each joint's own, or a small share of the others'."""
+    """An exact motion with travels, each joint's own or a small share of the others', and the check's speeds."""
     velocities = np.vstack([v0, v])
-    travels, speeds = np.abs(q - q0).max(axis=0), np.abs(velocities).max(axis=0)
+    travels = np.abs(q - q0).max(axis=0)
     root = np.sqrt(np.diag(lagrangian_jet(scene, q0, np.zeros_like(q0), backend="pinocchio").Lvv))
     # The speed at which a joint has the energy of the largest change.
     light = _LIGHT * (root * velocity_change(velocities)).max() / root
-    least = np.minimum(_LITTLE * largest_of_its_kind(scene, speeds), light)
     least_travel = np.minimum(_LITTLE * largest_of_its_kind(scene, travels), light * float(nodes[-1]) * dt)
     travel = max(float(travels.max()), SHORTEST)
-    travels, speeds = np.maximum(travels, least_travel), np.maximum(speeds, least)
-    return Exact(nodes, q, v, travel, np.maximum(travels, SHORTEST), np.maximum(speeds, SHORTEST))
+    travels = np.maximum(np.maximum(travels, least_travel), SHORTEST)
+    return Exact(nodes, q, v, travel, travels, np.maximum(speed_scales(scene, velocities), SHORTEST))
 
 
 def grown(plain: Floats, disturbed: Floats, disturbance: float) -> int:
