@@ -84,7 +84,7 @@ std::tuple<Out, Out, Out, Out, std::size_t> accelerations(const Mechanism& mecha
         ForwardDynamics dynamics(mechanism, true);
         for (; s < rows && dynamics.at(q.data() + s * n, v.data() + s * n); ++s) {
             dynamics.acceleration(force.data() + s * n, values.data() + s * n);
-            dynamics.differentiate(values.data() + s * n);
+            dynamics.differentiate(v.data() + s * n, values.data() + s * n);
             dynamics.derivatives(aq.data() + s * n * n, av.data() + s * n * n, af.data() + s * n * n);
         }
     }

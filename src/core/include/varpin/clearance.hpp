@@ -128,7 +128,7 @@ class Clearance {
         if (!slopes_.at(q, v)) return false;
         std::vector<double>& a = q_;
         slopes_.acceleration(rate_.data(), a.data());
-        slopes_.differentiate(a.data());
+        slopes_.differentiate(v, a.data());
         slopes_.derivatives(aq_.data(), av_.data(), af_.data());
         for (int i = 0; i < n_ * n_; ++i)
             lu_[i] = (i % (n_ + 1) == 0 ? 1.0 : 0.0) - 0.5 * h * av_[i] - 0.25 * h * h * aq_[i];

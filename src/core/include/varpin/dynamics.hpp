@@ -1,8 +1,9 @@
 // Forward dynamics and its derivatives, for the integrators on (q, v). docs/mathematics.md, "Explicit methods";
-// equation (X3). Inverse dynamics is tau = d(L_v)/dt - L_q. Along (v, a), the rate of (q, v), the jet changes by dM and
-// dA, and
+// equations (X3) and (X4). Inverse dynamics is tau = S . Phi, with Phi the force on the subtree of a joint. With
+// U_i = (W_i, S_i), X_i = (Z_i, 2 W_i), columns for (dq_i, dv_i), and C of `Coupling`, i an ancestor of j or j itself:
 //
-//     tau_q = dA - L_qq        tau_v = dM + A - A'
+//     dtau_j/d(q,v)_i = F_j . X_i + (C_j' S_j) . U_i
+//     dtau_i/d(q,v)_j = S_i . (Y_j X_j + C_j U_j + (S_j x* Phi_j, 0))
 #pragma once
 
 #include <algorithm>
@@ -13,9 +14,53 @@
 #include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
 #include "varpin/mechanism.hpp"
+#include "varpin/slopes.hpp"
 #include "varpin/spatial.hpp"
 
 namespace varpin {
+
+// C x = Y (x x V) + x x* H + V x* Y x. Of a body with first moment h, second moments J, velocity (u, w) and linear
+// momentum P it is
+//
+//     C (a, b) = (2 b x P, D b),    D b = w x T b + 2 (h . u) b - 2 (h . b) u,    T = 2 J - tr J;
+//
+// a drops out by Jacobi's identity. P and D are additive over bodies.
+struct Coupling {
+    Vec3<double> momentum{};  // P
+    Mat3<double> turn{};      // D
+
+    static Coupling of(const Inertia<double>& Y, const Motion<double>& V, const Force<double>& H) {
+        const auto& [xx, xy, yy, xz, yz, zz] = Y.second;
+        const Vec3<double>& h = Y.moment;
+        const double along = 2.0 * dot(h, V.linear);
+        Mat3<double> D{cross(V.angular, Vec3<double>{xx - yy - zz, 2.0 * xy, 2.0 * xz}) - (2.0 * h.x) * V.linear,
+                       cross(V.angular, Vec3<double>{2.0 * xy, yy - xx - zz, 2.0 * yz}) - (2.0 * h.y) * V.linear,
+                       cross(V.angular, Vec3<double>{2.0 * xz, 2.0 * yz, zz - xx - yy}) - (2.0 * h.z) * V.linear};
+        D.x.x += along;
+        D.y.y += along;
+        D.z.z += along;
+        return {H.linear, D};
+    }
+
+    // The angular part of C' x; the linear one vanishes.
+    Vec3<double> back(const Motion<double>& x) const {
+        const Vec3<double>& b = x.angular;
+        return 2.0 * cross(momentum, x.linear) + Vec3<double>{dot(turn.x, b), dot(turn.y, b), dot(turn.z, b)};
+    }
+};
+
+constexpr Coupling& operator+=(Coupling& a, const Coupling& b) {
+    a.momentum += b.momentum;
+    a.turn.x += b.turn.x;
+    a.turn.y += b.turn.y;
+    a.turn.z += b.turn.z;
+    return a;
+}
+// C x for an x with angular part b.
+template <class T>
+constexpr Force<T> operator*(const Coupling& C, const Vec3<T>& b) {
+    return {2.0 * cross(b, C.momentum), C.turn * b};
+}
 
 // Forward dynamics M a = force - bias at consecutive states, with work arrays. Derivatives need a mass matrix; without
 // them large trees use the articulated body algorithm.
@@ -32,11 +77,9 @@ class ForwardDynamics {
         jet_.M.resize(entries(n, n));
         ldl_.resize(n * n);
         if (!derivatives) return;
-        along_.emplace(mechanism.tree);
-        mechanism.couplings.fit(along_->couplings);
         slopes_.resize(entries(n, 2 * n));
-        if (mechanism.couplings.pushes()) {
-            for (auto* matrix : {&coupled_q_, &coupled_v_}) matrix->resize(n * n);
+        if (mechanism.couplings.any()) {
+            for (auto* matrix : {&coupled_q_, &coupled_v_, &coupled_curvature_}) matrix->resize(n * n);
         }
     }
 
@@ -46,10 +89,10 @@ class ForwardDynamics {
     // is not positive definite.
     bool at(const double* q, const double* v) {
         const Tree& tree = mechanism_->tree;
-        detail::clear_first(jet_.dof, jet_);
+        std::fill(jet_.potential.begin(), jet_.potential.end(), 0.0);
+        std::fill(jet_.potential_scale.begin(), jet_.potential_scale.end(), 0.0);
         if (!articulated_) detail::clear_blocks(tree, jet_.dof, jet_.M);
-        detail::add_elements(*mechanism_, q, jet_, 1);
-        for (int c = 0; c < jet_.dof; ++c) bias_[c] = -jet_.Lq[c];
+        add_potentials(q);
         std::copy_n(q, jet_.dof, q_.data());
         std::copy_n(v, jet_.dof, v_.data());
         for (int j = 0; j < tree.size(); ++j) {
@@ -59,12 +102,9 @@ class ForwardDynamics {
             detail::move(tree, j, v, jet_);
             here.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
             here.momentum = here.inertia * here.velocity;
+            body_[j].inertia = here.inertia;
             if (articulated_) articulated_->set_body(j, link.ratio * here.axis, here.inertia);
-            BodyState& own = body_[j];
-            own.acceleration =
-                link.parent < 0 ? Motion<double>{-1.0 * mechanism_->gravity, {}} : body_[link.parent].acceleration;
-            own.acceleration += (link.ratio * v[link.coordinate]) * here.axis_rate;
-            own.force = here.inertia * own.acceleration + cross(here.velocity, here.momentum);
+            accelerate(j, v, nullptr);
         }
         for (int c = 0; c < jet_.dof && articulated_; ++c) momentum_[c] = tree.armature[c] * v[c];
         bool regular = true;
@@ -76,7 +116,7 @@ class ForwardDynamics {
                 momentum_[c] += link.ratio * dot(jet_.body[j].axis, jet_.body[j].momentum);
                 if (link.parent >= 0) jet_.body[link.parent].momentum += jet_.body[j].momentum;
             } else {
-                detail::project_mass(tree, j, jet_.dof, jet_);
+                body_[j].mass = detail::project_mass(tree, j, jet_.dof, jet_);
             }
             bias_[link.coordinate] += link.ratio * dot(jet_.body[j].axis, body_[j].force);
             if (link.parent >= 0) {
@@ -127,28 +167,41 @@ class ForwardDynamics {
         for (int i = 0; i < jet_.dof; ++i) force[i] += bias_[i];
     }
 
-    // The derivatives of inverse dynamics at accelerations a, (X3), once after `acceleration`; for the calls below.
-    void differentiate(const double* a) {
+    // The derivatives of inverse dynamics at accelerations a, once after at() with the same v; for the calls below.
+    void differentiate(const double* v, const double* a) {
+        const Tree& tree = mechanism_->tree;
         const int n = jet_.dof;
-        for (int c = 0; c < n; ++c) {
-            at_q_[c] = {q_[c], v_[c]};
-            at_v_[c] = {v_[c], a[c]};
-        }
-        Jet<Dual>& along = *along_;
-        lagrangian_jet(*mechanism_, at_q_.data(), at_v_.data(), along);
-        for (const Block& block : mechanism_->tree.blocks) {
+        for (const Block& block : tree.blocks) {
             for (int i = block.begin; i < block.end; ++i) {
                 double* row = slopes_.data() + i * 2 * n;
-                for (int k = block.begin; k < block.end; ++k) {
-                    const Dual A = along.A[i * n + k];
-                    row[k] = along.Lqq[i * n + k].value - A.slope;
-                    row[n + k] = along.A[k * n + i].value - A.value - along.M[i * n + k].slope;
-                    if (coupled_q_.empty()) continue;
-                    row[k] += coupled_q_[i * n + k];
-                    row[n + k] += coupled_v_[i * n + k];
-                }
-                row[i] += acting_[i].by_q;
-                row[n + i] += acting_[i].by_v;
+                std::fill(row + block.begin, row + block.end, 0.0);
+                std::fill(row + n + block.begin, row + n + block.end, 0.0);
+                row[i] = acting_[i].by_q + curvature_[i];
+                row[n + i] = acting_[i].by_v;
+            }
+        }
+        for (int i = 0; i < n && !coupled_curvature_.empty(); ++i) {
+            for (int k = 0; k < n; ++k) {
+                slopes_[i * 2 * n + k] += coupled_q_[i * n + k] + coupled_curvature_[i * n + k];
+                slopes_[i * 2 * n + n + k] += coupled_v_[i * n + k];
+            }
+        }
+        for (int j = 0; j < tree.size(); ++j) {
+            const auto& here = jet_.body[j];
+            accelerate(j, v, a);
+            body_[j].coupling = Coupling::of(body_[j].inertia, here.velocity, here.momentum);
+            const int k = tree.bodies[j].parent;
+            Motion<double> Z = cross(acceleration_above(j), here.axis);
+            if (k >= 0) Z += cross(jet_.body[k].velocity, here.axis_rate);
+            body_[j].turning_slopes = slopes(here.axis_rate.angular, here.axis.angular);
+            body_[j].acceleration_slopes = slopes(Z, 2.0 * here.axis_rate);
+        }
+        for (int j = tree.size() - 1; j >= 0; --j) {
+            project_slopes(j);
+            const int k = tree.bodies[j].parent;
+            if (k >= 0) {
+                body_[k].force += body_[j].force;
+                body_[k].coupling += body_[j].coupling;
             }
         }
     }
@@ -207,9 +260,33 @@ class ForwardDynamics {
 
   private:
     struct BodyState {
-        Motion<double> acceleration{};  // A, without those of joints
-        Force<double> force{};          // Phi
+        Inertia<double> inertia{};             // of the body alone
+        Motion<double> acceleration{};         // A
+        Vec3<Slopes> turning_slopes{};         // U, angular
+        Motion<Slopes> acceleration_slopes{};  // X
+        Force<double> force{};                 // Phi
+        Force<double> mass{};                  // F
+        Coupling coupling{};
     };
+
+    // Potential energy of elements and couplings; its force is part of the bias.
+    void add_potentials(const double* q) {
+        std::fill(bias_.begin(), bias_.end(), 0.0);
+        std::fill(curvature_.begin(), curvature_.end(), 0.0);
+        mechanism_->forces.potentials(q, [&](int c, const Potential<double>& own) {
+            jet_.potential[mechanism_->tree.group[c]] += own.energy;
+            bias_[c] -= own.force;
+            curvature_[c] += own.curvature;
+        });
+        if (!mechanism_->couplings.any()) return;
+        std::fill(coupled_curvature_.begin(), coupled_curvature_.end(), 0.0);
+        mechanism_->couplings.potentials(q, jet_.couplings, [&](const auto& arms, const auto& own, double, double) {
+            jet_.potential[mechanism_->tree.group[arms.front().coordinate]] += own.energy;
+            for (const Arm<double>& arm : arms) bias_[arm.coordinate] += dot(own.slope, arm.linear);
+            if (coupled_curvature_.empty()) return;
+            Couplings::subtract_curvature(arms, own, jet_.dof, coupled_curvature_.data());
+        });
+    }
 
     // y = M x.
     void times_mass(const double* x, double* y) const {
@@ -236,14 +313,57 @@ class ForwardDynamics {
         return regular;
     }
 
+    Motion<double> acceleration_above(int j) const {
+        const int k = mechanism_->tree.bodies[j].parent;
+        return k < 0 ? Motion<double>{-1.0 * mechanism_->gravity, {}} : body_[k].acceleration;
+    }
+
+    // A and Phi of body j alone, with joint accelerations a (n), null for zero.
+    void accelerate(int j, const double* v, const double* a) {
+        const Body& link = mechanism_->tree.bodies[j];
+        const auto& here = jet_.body[j];
+        BodyState& own = body_[j];
+        own.acceleration = acceleration_above(j);
+        if (a) own.acceleration += (link.ratio * a[link.coordinate]) * here.axis;
+        own.acceleration += (link.ratio * v[link.coordinate]) * here.axis_rate;
+        own.force = own.inertia * own.acceleration + cross(here.velocity, here.momentum);
+    }
+
+    // Contribution of the subtree of body j to the derivatives of inverse dynamics, (X3) and (X4).
+    void project_slopes(int j) {
+        const Tree& tree = mechanism_->tree;
+        const Body& link = tree.bodies[j];
+        const auto& here = jet_.body[j];
+        const BodyState& own = body_[j];
+        const Force<double> F = own.mass;
+        const Vec3<double> back = own.coupling.back(here.axis);
+        const Force<double> turned = cross(here.axis, own.force);
+        Force<Slopes> moved = here.inertia * own.acceleration_slopes + own.coupling * own.turning_slopes;
+        moved += {slopes(turned.linear, {}), slopes(turned.angular, {})};
+        const int n = jet_.dof;
+        double* const to = slopes_.data();
+        const auto add = [&](int row, int column, Slopes more) {
+            double* entry = to + row * 2 * n + column;
+            entry[0] += more.q();
+            entry[n] += more.v();
+        };
+        for (int i = j; i >= 0; i = tree.bodies[i].parent) {
+            const Body& above = tree.bodies[i];
+            const BodyState& there = body_[i];
+            const double ratio = -above.ratio * link.ratio;
+            add(link.coordinate, above.coordinate,
+                ratio * (dot(there.acceleration_slopes, F) + dot(there.turning_slopes, back)));
+            if (i != j) add(above.coordinate, link.coordinate, ratio * dot(jet_.body[i].axis, moved));
+        }
+    }
+
     const Mechanism* mechanism_;
     Jet<double> jet_;  // placements, velocities, inertias of subtrees, M, potential
     std::vector<BodyState> body_;
     std::vector<double> q_ = zeros(jet_.dof), v_ = zeros(jet_.dof);
-    std::vector<JointForce<double>> acting_;     // (n) of elements, at the last force
-    std::vector<double> coupled_q_, coupled_v_;  // (n, n) of couplings, for derivatives
-    std::optional<Jet<Dual>> along_;             // the jet along (v, a), for derivatives
-    std::vector<Dual> at_q_ = std::vector<Dual>(jet_.dof), at_v_ = at_q_;
+    std::vector<JointForce<double>> acting_;                         // (n) of elements, at the last force
+    std::vector<double> curvature_ = zeros(jet_.dof);                // of the elements' potentials
+    std::vector<double> coupled_q_, coupled_v_, coupled_curvature_;  // (n, n) of couplings, for derivatives
     std::vector<double> bias_ = zeros(jet_.dof), room_ = zeros(jet_.dof);
     std::optional<ArticulatedBodies> articulated_;    // in place of M
     std::vector<double> momentum_ = zeros(jet_.dof);  // with articulated bodies only

@@ -139,7 +139,7 @@ class ExplicitStepper {
 
     // Derivatives of the accelerations at stage i, the state of `dynamics`.
     void differentiate(double h, int i) {
-        dynamics.differentiate(a_[i].data());
+        dynamics.differentiate(stage_v_.data(), a_[i].data());
         ForwardDynamics::Before before[4];
         for (int k = 0; k < i; ++k)
             before[k] = {nullptr, h * h * coefficients_.stage_q[i][k], h * coefficients_.stage_v[i][k]};

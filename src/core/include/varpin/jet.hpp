@@ -13,7 +13,6 @@
 #pragma once
 
 #include <algorithm>
-#include <array>
 #include <cmath>
 #include <type_traits>
 #include <vector>
@@ -21,8 +20,8 @@
 #include "varpin/dual.hpp"
 #include "varpin/elementary.hpp"
 #include "varpin/mechanism.hpp"
-#include "varpin/simd.hpp"
 #include "varpin/size.hpp"
+#include "varpin/slopes.hpp"
 #include "varpin/spatial.hpp"
 
 namespace varpin {
@@ -35,47 +34,42 @@ struct Magnitudes {
     double moment = 0.0;                   // m c
 };
 
-// Two numbers side by side in one vector register.
-struct Twin {
-    Pair both{0.0, 0.0};
-};
-inline Twin operator+(Twin a, Twin b) { return {a.both + b.both}; }
-inline Twin operator-(Twin a, Twin b) { return {a.both - b.both}; }
-inline Twin operator*(double s, Twin a) { return {Pair{s, s} * a.both}; }
-inline Twin operator*(Twin a, double s) { return s * a; }
-
-// The axis S of a body and its rate W, and their products with a force and an inertia; of doubles side by side.
+// Products of the axis of a body, and of its rate, with a force; for doubles in one vector register.
 template <class T>
 struct AxisAndRate {
     Motion<T> axis{}, rate{};
 
-    std::array<T, 2> of(const Force<T>& f) const { return {dot(axis, f), dot(rate, f)}; }
-    std::array<Force<T>, 2> moved(const Inertia<T>& Y) const { return {Y * axis, Y * rate}; }
+    struct Both {
+        T by_axis{}, by_rate{};
+    };
+    struct Moved {
+        Force<T> by_axis{}, by_rate{};
+    };
+    Both of(const Force<T>& f) const { return {dot(axis, f), dot(rate, f)}; }
+    Moved moved(const Inertia<T>& Y) const { return {Y * axis, Y * rate}; }
 };
 template <>
 struct AxisAndRate<double> {
-    Motion<Twin> twins{};
+    Motion<Slopes> both{};
 
     AxisAndRate() = default;
-    AxisAndRate(const Motion<double>& axis, const Motion<double>& rate)
-        : twins{twin(axis.linear, rate.linear), twin(axis.angular, rate.angular)} {}
+    AxisAndRate(const Motion<double>& axis, const Motion<double>& rate) : both(slopes(rate, axis)) {}
 
-    std::array<double, 2> of(const Force<double>& f) const {
-        const Pair found = dot(twins, f).both;
-        return {found[0], found[1]};
+    struct Both {
+        double by_axis, by_rate;
+    };
+    struct Moved {
+        Force<double> by_axis, by_rate;
+    };
+    Both of(const Force<double>& f) const {
+        const Slopes found = dot(both, f);
+        return {found.v(), found.q()};
     }
-    std::array<Force<double>, 2> moved(const Inertia<double>& Y) const {
-        const Force<Twin> found = Y * twins;
-        const auto part = [&](int k) {
-            const auto& [l, a] = found;
-            return Force<double>{{l.x.both[k], l.y.both[k], l.z.both[k]}, {a.x.both[k], a.y.both[k], a.z.both[k]}};
-        };
-        return {part(0), part(1)};
-    }
-
-  private:
-    static Vec3<Twin> twin(const Vec3<double>& a, const Vec3<double>& b) {
-        return {{Pair{a.x, b.x}}, {Pair{a.y, b.y}}, {Pair{a.z, b.z}}};
+    Moved moved(const Inertia<double>& Y) const {
+        const Force<Slopes> found = Y * both;
+        const auto [l, a] = found;
+        return {{{l.x.v(), l.y.v(), l.z.v()}, {a.x.v(), a.y.v(), a.z.v()}},
+                {{l.x.q(), l.y.q(), l.z.q()}, {a.x.q(), a.y.q(), a.z.q()}}};
     }
 };
 
@@ -268,26 +262,25 @@ void project_second(const Mechanism& mechanism, int j, Size n, Jet<T>& w) {
         const auto& there = w.body[i];
         const int ci = above.coordinate;
         const double ratio = above.ratio * link.ratio;
-        const auto [axis_F, rate_F] = there.columns.of(F);
-        const auto [axis_B, rate_B] = there.columns.of(B);
-        const T mass = ratio * axis_F;
+        const auto of_F = there.columns.of(F), of_B = there.columns.of(B);
+        const T mass = ratio * of_F.by_axis;
         w.M[ci * n + cj] += mass;
-        w.A[ci * n + cj] += ratio * axis_B;
+        w.A[ci * n + cj] += ratio * of_B.by_axis;
         if (i != j) {
             w.M[cj * n + ci] += mass;
-            w.A[cj * n + ci] += ratio * rate_F;
+            w.A[cj * n + ci] += ratio * of_F.by_rate;
         }
         if constexpr (curved) {
-            const T curvature = ratio * (rate_B - dot(there.axis.angular, turning));
+            const T curvature = ratio * (of_B.by_rate - dot(there.axis.angular, turning));
             w.Lqq[ci * n + cj] += curvature;
             if (i != j) w.Lqq[cj * n + ci] += curvature;
         }
     }
 }
 
-// The share of what body j carries in M alone: the composite rigid body algorithm.
+// The share of what body j carries in M alone: the composite rigid body algorithm. Returns F.
 template <class T, class Size>
-void project_mass(const Tree& tree, int j, Size n, Jet<T>& w) {
+Force<T> project_mass(const Tree& tree, int j, Size n, Jet<T>& w) {
     const Body& link = tree.bodies[j];
     const Force<T> F = w.body[j].inertia * w.body[j].axis;
     const int cj = link.coordinate;
@@ -297,6 +290,7 @@ void project_mass(const Tree& tree, int j, Size n, Jet<T>& w) {
         w.M[above.coordinate * n + cj] += mass;
         if (i != j) w.M[cj * n + above.coordinate] += mass;
     }
+    return F;
 }
 
 // Add the subtree of body j to its parent. Joints above an origin are prismatic: only masses and linear momenta count.
