@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import threading
 from contextlib import ContextDecorator
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 
 class OneThread(ContextDecorator):
@@ -17,19 +18,21 @@ class OneThread(ContextDecorator):
 
     def __init__(self) -> None:
         self._lock, self._users = threading.Lock(), 0
-        self._limit: threadpool_limits | None = None
+        # To find the libraries takes as long as a small search.
+        self._pools = ThreadpoolController()
+        self._limit = contextlib.ExitStack()
 
     def __enter__(self) -> None:
         with self._lock:
             if self._users == 0:
-                self._limit = threadpool_limits(limits=1, user_api="blas")
+                self._limit.enter_context(self._pools.limit(limits=1, user_api="blas"))
             self._users += 1
 
     def __exit__(self, *_: object) -> None:
         with self._lock:
             self._users -= 1
-            if self._users == 0 and self._limit is not None:
-                self._limit.restore_original_limits()
+            if self._users == 0:
+                self._limit.close()
 
 
 @functools.cache
