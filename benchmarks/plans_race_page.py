@@ -34,7 +34,7 @@ def ratio(task: dict[str, Any], way: str) -> float:
 
 
 def summary(results: Results) -> str:
-    lines = [f"{len(results)} of the tasks:", ""]
+    lines = [f"Of {len(results)} tasks:", ""]
     for way, words in WAYS.items():
         found = np.array([ratio(task, way) for task in results.values()])
         found = found[~np.isnan(found)]

@@ -60,7 +60,7 @@ class BoundBetween(BoundConstraint):
         """See :meth:`BoundConstraint.value`; for one motion. Infinite where a step fails in parts."""
         if self.ends is None:
             return self.inner.value(*self._states(q, v), u)
-        (found,) = self._in_parts(self._given(q, v, u)[None])
+        found: Floats = self._in_parts(self._given(q, v, u)[None])[0]
         return found
 
     def _given(self, q: Floats, v: Floats, u: Floats) -> Floats:
