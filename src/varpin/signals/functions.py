@@ -9,12 +9,17 @@ zero up to terms of higher order. A quadrature that is refined where it has not 
 from __future__ import annotations
 
 import functools
+import io
+import logging
 import math
+import pickle
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import cloudpickle
 import numpy as np
+import pinocchio as pin
 from numpy.polynomial.legendre import legvander
 
 from varpin.arrays import Floats, Integers
@@ -25,6 +30,9 @@ from varpin.mechanics.scene import Scene
 from varpin.signals.commands import Times, changing, open_loop, prescribing
 from varpin.signals.policy import OpenLoop
 from varpin.support.checks import JointValues, control_values, finite_array, require_finite, takes
+from varpin.support.frozen import Frozen
+
+logger = logging.getLogger(__name__)
 
 ControlLaw = Callable[[float, Floats, Floats], JointValues]
 # Values (K, m) of a function at times (K,) [s] in steps (K,).
@@ -61,6 +69,42 @@ def decision(law: ControlLaw, scene: Scene, step: int, time: float, q: Floats, v
     """The control (1, m) of the period that begins with a step, at its time [s]; a ControlError if the law failed."""
     read = _reader("controls(t, q, v)", scene)
     return _called("controls(t, q, v)", lambda: law(time, q.copy(), v.copy()), read, step, time)[None]
+
+
+class KeptLaw:
+    """A control law as it was when it was kept, with all that it changes when it is called.
+
+    Copies are by value, as of functions that are sent to other processes: calls of a copy change nothing of the user's.
+    Frozen objects, and models and data of Pinocchio, are shared.
+    """
+
+    class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
+        def __init__(self, file: io.BytesIO, shared: list[object]) -> None:
+            super().__init__(file)
+            self._shared = shared
+
+        def persistent_id(self, value: object) -> int | None:
+            if not isinstance(value, Frozen | pin.Model | pin.Data):
+                return None
+            self._shared.append(value)
+            return len(self._shared) - 1
+
+    def __init__(self, law: ControlLaw) -> None:
+        self._written, self._shared = io.BytesIO(), list[object]()
+        self.known = True  # whether the law can be copied
+        try:
+            self._Pickler(self._written, self._shared).dump(law)
+        except Exception as error:
+            # What a law refers to may be anything: a socket, a running generator.
+            self.known = False
+            logger.debug("a control law cannot be copied: %r", error)
+
+    def copy(self) -> ControlLaw:
+        """A copy of the law."""
+        reader = pickle.Unpickler(io.BytesIO(self._written.getvalue()))
+        reader.persistent_load = self._shared.__getitem__  # type: ignore[method-assign]
+        law: ControlLaw = reader.load()
+        return law
 
 
 @dataclass(frozen=True)
@@ -278,6 +322,7 @@ def _reader(name: str, scene: Scene) -> Callable[[JointValues], Floats]:
     """The function from what a user's function returns to the control (m,)."""
     shape, joints, isfinite = (scene.controls,), scene.control_joints, math.isfinite
 
+    @np.errstate(over="ignore", invalid="ignore")
     def read(value: JointValues) -> Floats:
         # The common case: all checks take longer than many functions.
         if isinstance(value, np.ndarray) and value.dtype == np.float64 and value.shape == shape:

@@ -14,7 +14,7 @@ import numpy as np
 
 from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands
-from varpin.errors import AssemblyError, SingularMassMatrix
+from varpin.errors import AssemblyError, ControlError, SingularMassMatrix
 from varpin.finding import Finding
 from varpin.integrators import Gauss, Integrator, Radau, Reference, RungeKutta4
 from varpin.integrators.base import drifts, noise_impulses
@@ -26,11 +26,10 @@ from varpin.mechanics.scene import Scene
 from varpin.model import joint_unit
 from varpin.signals.commands import changing, cubics, in_parts, in_parts_of_steps, open_loop, prescribing, rows, shares
 from varpin.signals.controls import Controls, commands_of
-from varpin.signals.functions import Sampled, left_by_stages
+from varpin.signals.functions import ControlLaw, KeptLaw, Sampled, decision, left_by_stages
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.gate import proven_error
 from varpin.simulation.limits import beyond_limits
-from varpin.simulation.loop import Law, law_of
 from varpin.simulation.spectrum import contact_rate, fastest_rate, speed_scales, travel_scales
 from varpin.simulation.start import finer
 from varpin.simulation.velocity_noise import wrong_spread
@@ -67,6 +66,7 @@ def check(
     restart: int = 0,
     known: Floats | None = None,
     hold: int = 0,
+    law: KeptLaw | None = None,
 ) -> Trajectory:
     """The motion with its error and its warnings, the worst first.
 
@@ -78,6 +78,7 @@ def check(
         restart: Steps after which a controller corrects errors: the repetition begins anew there; 0 for none.
         known: The error, if it is known (N + 1, n): nothing is repeated.
         hold: The period of a control law in steps, 0 for none.
+        law: The law as it was before the motion.
     """
     function = controls if isinstance(controls, Sampled) else None
     extremes = None if function is None else function.whole.extremes
@@ -95,11 +96,13 @@ def check(
     # A function of time would be called again for parts of a step, at whatever time the error is asked for.
     calls = isinstance(controls, OpenLoop) and closer(scene, integrator, trajectory, sampled=True)[1] > 1
     resolved = function is None or left_by_stages(function, len(integrator.stage_times)) <= _RESOLVED
-    proven = proven_error(scene, integrator, trajectory) if resolved and not (held_mean or calls) else None
+    # What a law makes of an error, only its calls show.
+    alone = resolved and not (held_mean or calls or law)
+    proven = proven_error(scene, integrator, trajectory) if alone else None
 
     def repeat() -> tuple[Floats, Floats, float]:
-        law = law_of(scene, trajectory, hold) if hold else None
-        return repeated(scene, integrator, trajectory, controls, restart, law, hold)
+        again = law.copy() if law is not None and law.known else None
+        return repeated(scene, integrator, trajectory, controls, restart, again, hold)
 
     found: tuple[Finding, ...] = ()
     if proven is not None:
@@ -159,7 +162,7 @@ def repeated(
     trajectory: Trajectory,
     controls: Controls | Commands = None,
     restart: int = 0,
-    law: Law | None = None,
+    law: ControlLaw | None = None,
     hold: int = 0,
 ) -> tuple[Floats, Floats, float]:
     """A motion repeated by the method of :func:`closer`: q and v (N + 1, n), NaN where it failed; and its share.
@@ -186,7 +189,13 @@ def repeated(
         if restart and first:
             state, _ = method.start(scene, trajectory.q[done : done + 1], trajectory.v[done : done + 1])
         if law is not None:
-            block = open_loop(law.control(scene, q[done], v[done])[None])._replace(hold=taken.stop - first)
+            try:
+                u = decision(law, scene, done, done * trajectory.dt, q[done], v[done])
+            except ControlError:
+                break
+            period = hold * trajectory.dt
+            u = in_parts_of_steps(scene, u, q[None, done], v[None, done], period, chunk)
+            block = open_loop(u[: taken.stop - first])
         else:
             before = last.u[None, -1] if first else None
             block = rows(commands, first // commands.hold, -(-taken.stop // commands.hold), before)

@@ -22,7 +22,6 @@ from varpin.integrators.explicit import accelerations
 from varpin.mechanics.assembly import nearest
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.signals.commands import no_limits
 from varpin.trajectory import Trajectory
 
 # Least nodes of a fit, spread over the motion, but four a joint at least: 30 to 300 give the same.
@@ -57,20 +56,12 @@ class Law:
         c: (m,).
         directions: Of (q, v), in which the motion tells the law (2n, r).
         near: A configuration of the motion (n,) [rad or m].
-        limits: The ends of the range of each control where it is there more than once (2, m); else infinite.
     """
 
     K: Floats
     c: Floats
     directions: Floats
     near: Floats
-    limits: Floats
-
-    def control(self, scene: Scene, q: Floats, v: Floats) -> Floats:
-        """The control (m,) at a state (n,), (n,)."""
-        found = self.K @ np.concatenate([q, v, lagrangian_jet(scene, q, np.zeros_like(q)).Lq]) + self.c
-        limited: Floats = np.clip(found, *self.limits)
-        return limited
 
 
 def law_of(scene: Scene, trajectory: Trajectory, hold: int) -> Law | None:
@@ -95,10 +86,8 @@ def decisions(trajectory: Trajectory, hold: int) -> tuple[Integers, Floats, Floa
 def _law(scene: Scene, x: Floats, u: Floats) -> Law | None:
     """The law from all nodes or, where it clips, of each control from the nodes at which it is inside its limits."""
     law = fitted_law(scene, x, u)
-    ends = np.array([u.min(axis=0), u.max(axis=0)])
-    at_end = u == ends[:, None]
-    often = at_end.sum(axis=1) > 1
-    clipped = (at_end & often[:, None]).any(axis=0)
+    at_end = u == np.array([u.min(axis=0), u.max(axis=0)])[:, None]
+    clipped = (at_end & (at_end.sum(axis=1) > 1)[:, None]).any(axis=0)
     if law is not None or not clipped.any():
         return law
     laws = [fitted_law(scene, x[~rows], u[~rows, k : k + 1]) for k, rows in enumerate(clipped.T)]
@@ -107,8 +96,7 @@ def _law(scene: Scene, x: Floats, u: Floats) -> Law | None:
     if len(known) < len(laws):
         return None
     K, c = np.concatenate([law.K for law in known]), np.concatenate([law.c for law in known])
-    limits = np.where(often, ends, [[-np.inf], [np.inf]])
-    return Law(K, c, known[0].directions, known[0].near, limits)
+    return Law(K, c, known[0].directions, known[0].near)
 
 
 def fitted_law(scene: Scene, x: Floats, u: Floats) -> Law | None:
@@ -125,7 +113,7 @@ def fitted_law(scene: Scene, x: Floats, u: Floats) -> Law | None:
         return None
     K, c, directions = fit
     K = np.pad(K, ((0, 0), (0, 3 * n - K.shape[1])))
-    return Law(K, c, directions[: 2 * n], x[0, :n], no_limits(len(K)))
+    return Law(K, c, directions[: 2 * n], x[0, :n])
 
 
 def _affine(x: Floats, u: Floats) -> tuple[Floats, Floats, Floats] | None:
@@ -193,8 +181,10 @@ def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[
 
 
 def _finding(scene: Scene, control: int, text: str, value: float, time: float | None = None) -> tuple[Finding, ...]:
+    """The warning with a text in which {} stands for the control."""
     joint = None if scene.control_joints is None else scene.control_joints[control]
-    return (Finding("unstable loop", text, joint=joint, time=time, value=value),)
+    name = f"control {control}" if joint is None else f"the control of joint {joint!r}"
+    return (Finding("unstable loop", text.format(name), joint=joint, time=time, value=value),)
 
 
 def _by_theory(scene: Scene, law: Law, period: float) -> tuple[Finding, ...]:
@@ -230,7 +220,7 @@ def _by_turns(scene: Scene, x: Floats, u: Floats, t: Floats, period: float) -> t
     if not left @ left < (1.0 - _FOLLOWS) * (len(at) - x.shape[1]) * side.var():
         return ()
     text = (
-        f"control {worst} turns back {len(at)} times in {len(u)} periods of {period:.4g} s: the law is too fast for "
+        f"{{}} turns back {len(at)} times in {len(u)} periods of {period:.4g} s: the law is too fast for "
         "its period. Use a shorter period, or lower gains"
     )
     return _finding(scene, worst, text, float(len(at)), float(t[at[0] + 1]))
@@ -247,7 +237,7 @@ def _by_growth(scene: Scene, trajectory: Trajectory, u: Floats, period: float) -
     if not grew[worst] >= _GREW or not work.sum() > 0.0:
         return ()
     text = (
-        f"control loop is unstable at its period of {period:.4g} s: control {worst} grows by a factor of "
+        f"control loop is unstable at its period of {period:.4g} s: {{}} grows by a factor of "
         f"{grew[worst]:.3g}. Use a shorter period, or lower gains, or check the signs of the law"
     )
     return _finding(scene, worst, text, float(grew[worst]))

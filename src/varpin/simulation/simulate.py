@@ -17,7 +17,7 @@ from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.signals.commands import open_loop
 from varpin.signals.controls import Controls, commands_of
-from varpin.signals.functions import ControlLaw, Sampled, function_findings, require_law
+from varpin.signals.functions import ControlLaw, KeptLaw, Sampled, function_findings, require_law
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.check import check as checked
 from varpin.simulation.choice import given_integrator, usual_integrator
@@ -97,9 +97,9 @@ def simulate(
             of linear controls, which are zero if left out, to replay or refine a path, see
             :mod:`varpin.mechanics.wiener`. 0 gives the motion without noise and without the warning.
         check: Find the error of the motion, ``Trajectory.error``, and what is doubtful, ``Trajectory.warnings``. Where
-            the record alone shows the motion right the check takes half of the motion's time; else it repeats the
-            motion by a method of two stages more, with forces and stiff methods in half steps, which takes two to five
-            times as long as the motion.
+            the record alone shows the motion right the check takes half of the motion's time; else, and under a control
+            law, of which it calls a copy, it repeats the motion by a method of two stages more, with forces and stiff
+            methods in half steps, which takes two to five times as long as the motion.
         progress: Called now and then with (steps done, steps in all). A function with three required arguments, such
             as :class:`varpin.LiveView`, also gets a :class:`varpin.Nodes` with the nodes since the last call, whose
             last node comes first again.
@@ -181,6 +181,7 @@ def simulate(
     state, (start,) = integrator.start(scene, q0[None], v0[None])
     held = commands.hold > 1 and not law
     record = MotionRecord(scene, integrator, dt, dw, start, commands if linear else None, held=held)
+    kept = KeptLaw(controls) if check and callable(controls) else None
     interrupted = not _roll(record, state, steps, controls, commands, Reporter(progress, steps, dt), hold, check=check)
     motion = record.trajectory()
     known = None if interrupted else error
@@ -189,7 +190,7 @@ def simulate(
         if check:
             ended = interrupted and not isinstance(controls, Sampled)
             more = None if callable(controls) or ended else controls
-            motion = checked(scene, integrator, motion, more, known=known, hold=period if law else 0)
+            motion = checked(scene, integrator, motion, more, known=known, hold=period if law else 0, law=kept)
             loop = () if hold is None else unstable_loop(scene, motion, hold)
             wrong = [finding for finding in motion.warnings if finding.kind == "error"]
             unsettled = function_findings(controls) if isinstance(controls, Sampled) else ()
