@@ -146,7 +146,7 @@ def test_the_count_of_turns():
     (finding,) = unstable_loop(ROD, motion)
     assert finding.value > 290
     assert 0.0 < finding.time < 0.3
-    assert naming([finding], "control 0", f"{finding.value:.0f} times", "300 periods", "0.01 s")
+    assert naming([finding], "joint1", f"{finding.value:.0f} times", "300 periods", "0.01 s")
 
 
 def test_a_law_without_limits_does_not_go_from_one_to_the_other():
