@@ -1,16 +1,19 @@
 """A control loop that is unstable at its period is told of, and no other."""
 
 import logging
+import threading
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from findings import about
+from oracles import exact
 from refusals import naming, refused
 from scipy.linalg import expm
 from scipy.optimize import fsolve
 
 import varpin as vp
+from varpin.model.chain import rod_chain
 from varpin.simulation.loop import unstable_loop
 
 KIND = "unstable loop"
@@ -296,3 +299,37 @@ def test_an_ensemble_whose_loop_is_unstable_says_so():
     calm = vp.LinearPolicy(np.zeros((N, 1)), 0.2 * gains, policy.reference, on="velocity")
     quiet = vp.simulate_ensemble(scene, [0.0], [0.0], paths=20, rng=0, controls=calm, **options)
     assert not told(quiet), quiet.warnings
+
+
+@pytest.mark.parametrize("integrator", [None, vp.Gauss(2), vp.RungeKutta4()])
+def test_the_error_under_a_law_has_its_feedback(integrator):
+    """A computed torque with an integral of its own, which compensates dampers that are as fast as its period."""
+    scene, h, goal, rest = vp.Scene(rod_chain([1.0, 0.3], [1.0, 0.2]), damping=0.2), 5e-3, [0.5, -0.4], np.zeros(2)
+    model = scene.robot.model
+    data = model.createData()
+
+    def law(missed):
+        def torque(t, q, v):
+            missed.append(np.subtract(goal, q))
+            wanted = 100.0 * missed[-1] - 20.0 * v + 50.0 * h * np.sum(missed, axis=0)
+            return pin.rnea(model, data, q, v, wanted) + 0.2 * v
+
+        return torque
+
+    calls, again = [], law([])
+    motion = vp.simulate(scene, rest, rest, dt=h, steps=100, controls=law(calls), integrator=integrator)
+    signal = lambda k, q, v, t=motion.t: lambda _, u=again(t[k], q, v): u  # noqa: E731
+    off = np.abs(motion.q - exact(scene, rest, rest, motion.t, signal).q)
+    assert abs(motion.error.max() - off.max()) <= 0.1 * off.max()
+    assert len(calls) == motion.steps
+
+
+def test_a_law_that_cannot_be_copied_keeps_its_record():
+    lock = threading.Lock()
+
+    def law(t, q, v):
+        with lock:
+            return -5.0 * np.sin(q) - v
+
+    motion = vp.simulate(ROD, [0.5], [0.0], dt=1e-2, steps=100, controls=law)
+    assert 0.0 < motion.error.max() < 1e-6
