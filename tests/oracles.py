@@ -283,8 +283,9 @@ def exact(
     *,
     path: Path | None = None,
     stiff: bool = False,
+    rtol: float | None = None,
 ) -> Motion:
-    """The continuous motion at ``times``, by DOP853 or, stiff, by SciPy's Radau.
+    """The continuous motion at ``times``, by DOP853 to 1e-12 or, stiff, by SciPy's Radau to 1e-11.
 
     Between times k and k + 1 the controls are the function of time that ``signal(k, q, v)`` returns at the state of
     time k: rows, laws and policies are constant over an interval, open loops are not. None holds servos at ``q0``.
@@ -305,8 +306,9 @@ def exact(
             _, pull, rest = own.forces(q, v, resting if force is None else scene.actuation @ force(t))
             return np.concatenate([v, own.acceleration(t, q, v, pull + rest), [v @ rest]])
 
-        method, rtol = ("Radau", 1e-11) if stiff else ("DOP853", 1e-12)
-        x = solve_ivp(rate, (begin, end), x, method, rtol=rtol, atol=1e-3 * rtol).y[:, -1]
+        method, usual = ("Radau", 1e-11) if stiff else ("DOP853", 1e-12)
+        share = rtol or usual
+        x = solve_ivp(rate, (begin, end), x, method, rtol=share, atol=1e-3 * share).y[:, -1]
         rows.append(x)
     y = np.array(rows)
     q, v = y[:, :n], y[:, n : 2 * n]

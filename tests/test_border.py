@@ -242,26 +242,29 @@ def test_what_does_not_fit_is_refused(every, change):
     assert taken == []
 
 
-@pytest.mark.parametrize("halvings", [-1, 63])
-def test_halvings_that_cannot_be_counted_are_refused(halvings):
-    with refused(ValueError, "halvings", "62"):
-        core.Guards.make(**{**GUARDS, "most_halvings": halvings})
-
-
-@pytest.mark.parametrize("rate", [-2, 1])
-def test_rates_that_are_no_controls_are_refused(rate):
+def with_rate(rate):
     own = vp.Scene(vp.planar_chain(1), constraints=vp.KinematicInput("joint1"))
     rows = own.bound_constraints.rows
     rows = rows._replace(ties=tuple(tie._replace(rate=rate) for tie in rows.ties))
-    with refused(ValueError, "control"):
-        core.Mechanism.make(**of_mechanism(own) | {"constraints": rows})
+    return core.Mechanism.make(**of_mechanism(own) | {"constraints": rows})
 
 
-@pytest.mark.parametrize("level", [0, 63])
-def test_parts_that_no_step_has_are_refused(level):
-    given = {**steps(scene()), "halvings": np.array([1, 1, 2, 2, 2, level], dtype=np.uint8)}
-    with refused(ValueError, "halvings", "62"):
-        core.Steps(**given)
+def with_level(level):
+    return core.Steps(**{**steps(scene()), "halvings": np.array([1, 1, 2, 2, 2, level], dtype=np.uint8)})
+
+
+@pytest.mark.parametrize(
+    ("make", "values", "facts"),
+    [
+        (lambda most: core.Guards.make(**{**GUARDS, "most_halvings": most}), (-1, 63), ("halvings", "62")),
+        (with_rate, (-2, 1), "control"),
+        (with_level, (0, 63), ("halvings", "62")),
+    ],
+)
+def test_numbers_that_cannot_be_are_refused(make, values, facts):
+    for value in values:
+        with refused(ValueError, facts):
+            make(value)
 
 
 @pytest.mark.parametrize("path", [-1, P])

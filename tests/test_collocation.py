@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-import scipy.linalg
 from mechanisms import slider
 from refusals import refused
 
@@ -37,29 +36,6 @@ def test_tableau(kind, stages):
 def oscillator(stiffness):
     """A mass of 1 kg on a spring, nothing else."""
     return vp.Scene(slider(), stiffness=stiffness, gravity=False)
-
-
-@pytest.mark.parametrize("stages", ALL)
-def test_a_spring_is_turned_by_the_pade_approximant(stages):
-    """One step of the oscillator is the diagonal Pade approximant of exp(h [[0, 1], [-k, 0]]), stiff or not."""
-    for product in (0.3, 5.0, 400.0):  # h sqrt(k)
-        motion = vp.simulate(
-            oscillator(product**2), [1.0], [0.7], dt=1.0, steps=1, integrator=vp.Gauss(stages), check=False
-        )
-        assert motion.statistics.split_steps == 0
-        Z = np.array([[0.0, 1.0], [-(product**2), 0.0]])
-        factors = [1.0]
-        for j in range(1, stages + 1):
-            factors.append(factors[-1] * (stages - j + 1) / (j * (2 * stages - j + 1)))
-        # Scaled, so that the powers of a stiff spring's matrix stay of one size.
-        S = np.diag([1.0, product])
-        Y = np.linalg.solve(S, Z @ S)
-        powers = [np.linalg.matrix_power(Y, j) for j in range(stages + 1)]
-        P = sum(f * power for f, power in zip(factors, powers, strict=True))
-        N = sum(f * (-1) ** j * power for j, (f, power) in enumerate(zip(factors, powers, strict=True)))
-        expected = np.linalg.solve(N, P @ [1.0, 0.7 / product])
-        given = np.array([motion.q[1, 0], motion.v[1, 0] / product])
-        np.testing.assert_allclose(given, expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("stages", [1, 2, 3])
@@ -129,23 +105,6 @@ def test_a_spring_beside_a_damper_keeps_its_energy():
     np.testing.assert_allclose(energy / energy[0], 1.0, rtol=0, atol=0.01)
     exact = 0.5 * np.cos(50.0 * motion.t)
     assert np.abs(motion.q[:, 0] - exact).max() < 0.005
-
-
-@pytest.mark.parametrize("stages", [1, 2, 3, 6])
-@pytest.mark.parametrize("stiffness", [1e-2, 1e2, 1e4])
-@pytest.mark.parametrize("damping", [0.0, 1e-2, 1e4])
-def test_stiff_springs_and_dampers(stages, stiffness, damping):
-    """Springs and dampers far faster than the step: finite, bounded, and dissipating what they should."""
-    scene = vp.Scene(vp.load_robot("finger"), gravity=False, stiffness=stiffness, damping=damping)
-    motion = vp.simulate(
-        scene, [0.1, 0.1, 0.1], np.zeros(3), dt=1e-2, steps=100, integrator=vp.Gauss(stages), check=False
-    )
-    assert np.isfinite(motion.q).all()
-    if damping == 0.0:
-        assert np.abs(motion.energy / motion.energy[0] - 1.0).max() < 0.1
-    else:
-        assert motion.energy[-1] < motion.energy[0]
-        assert motion.energy.max() <= motion.energy[0] * (1.0 + 1e-9)
 
 
 # Integrators, links of chains that fall from rest, steps [s], largest error of the energy in units of g L^2 / 2.
@@ -224,17 +183,6 @@ def test_a_constant_torque_is_guarded_like_a_potential(dt):
     np.testing.assert_allclose(torque.statistics.energy_defect, errors[1:], rtol=0, atol=1e-9)
 
 
-def test_without_the_energy_guard_there_are_silent_jumps():
-    """What the guard is for: without it runs at coarse steps jump to other branches of solutions."""
-    unguarded = vp.Midpoint(guard=vp.Guard(energy_balance=1e12, energy_budget=1e12))
-    scene = vp.Scene(vp.planar_chain(2))
-    try:
-        motion = vp.simulate(scene, np.zeros(2), np.zeros(2), dt=0.1, steps=2000, integrator=unguarded)
-    except vp.StepFailure as failure:
-        motion = failure.trajectory
-    assert np.abs(motion.energy - motion.energy[0]).max() > 20.0 * GRAVITY * 4 / 2
-
-
 def test_without_a_guard_no_step_is_cut():
     scene = vp.Scene(vp.planar_chain(3))
     start = {"q0": np.zeros(3), "v0": np.full(3, 8.0), "dt": 0.1, "steps": 20}
@@ -246,25 +194,6 @@ def test_without_a_guard_no_step_is_cut():
         plain = failure.trajectory
     assert (plain.statistics.substeps <= 1).all()
     assert np.isinf(plain.statistics.branch_margin).all()
-
-
-def test_branch_margin_bounds_the_smallest_eigenvalue():
-    """The recorded margin against dense eigenvalues of M^-1 (M - h^2/4 L_qq / (1 - 1/2)) at the root."""
-    scene = vp.Scene(vp.planar_chain(3))
-    unguarded = vp.Midpoint(guard=vp.Guard(energy_balance=1e12, energy_budget=1e12))
-    rng = np.random.default_rng(0)
-    margins = []
-    for _ in range(40):
-        q, v, dt = rng.uniform(-2, 2, 3), rng.normal(size=3) * 10, rng.uniform(1e-2, 0.1)
-        motion = vp.simulate(scene, q, v, dt=dt, steps=1, integrator=unguarded)
-        if motion.statistics.split_steps:
-            continue
-        jet = vp.lagrangian_jet(scene, 0.5 * (motion.q[0] + motion.q[1]), (motion.q[1] - motion.q[0]) / dt)
-        smallest = scipy.linalg.eigh(jet.Lvv - dt**2 / 2 * jet.Lqq, jet.Lvv, eigvals_only=True)[0]
-        assert 0.0 < smallest <= motion.statistics.branch_margin[0] * (1.0 + 1e-2)
-        margins.append(smallest)
-    assert min(margins) < 0.5
-    assert len(margins) > 20
 
 
 def test_failure_keeps_what_was_done():

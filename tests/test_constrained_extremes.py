@@ -128,13 +128,3 @@ def test_light_links_that_carry_a_heavy_one_take_long_steps(integrator):
     motion, off, rate_off = moved(number, integrator, 3)
     assert motion.statistics.split_steps == 0
     assert max(off, rate_off) < (2e-2 if integrator.order == 2 else 1e-4)
-
-
-@pytest.mark.parametrize(("integrator", "steps"), [(vp.Midpoint(), 60), (vp.Gauss(2), 30), (vp.Gauss(3), 15)])
-def test_two_driven_arms_converge_with_the_order_of_the_integrator(integrator, steps):
-    errors = []
-    for N in (steps, 2 * steps):
-        motion, off, rate_off = moved(len(LOOPS) - 1, integrator, N)
-        assert motion.statistics.split_steps == 0
-        errors.append(max(off, rate_off))
-    assert np.log2(errors[0] / errors[1]) > integrator.order - 0.4

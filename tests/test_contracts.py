@@ -328,15 +328,6 @@ def test_kinks(name):
         np.testing.assert_allclose(motion.energy[::500], own.energy, rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", [name for name in zoo.ZOO if name not in MOVED])
-def test_the_oracle_balances(name):
-    """The oracle's own energy changes by the work of its forces without potential."""
-    case = zoo.ZOO[name]
-    own = oracle(case, BY_NAME["open loop"], False)
-    size = np.abs(own.energy).max() + np.abs(own.work).max()
-    np.testing.assert_allclose(own.energy - own.energy[0], own.work, rtol=0, atol=1e-9 * size)
-
-
 @pytest.mark.parametrize("signal", [SIGNALS[0], *SIGNALS[3:]], ids=lambda signal: signal.name)
 @pytest.mark.parametrize("name", [*SILENT[::5], "stops", "servos", "frame springs"])
 def test_reference(name, signal):
@@ -359,18 +350,6 @@ def test_the_ledger_is_the_drift(name, driven):
         if len(set(case.scene.group)) == 1:
             np.testing.assert_allclose(motion.statistics.energy_defect, drift, rtol=1e-6, atol=1e-12 * size)
         assert (motion.statistics.energy_defect >= drift - 1e-12 * size).all()
-
-
-@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(1)], ids=str)
-def test_the_heat_of_dampers_is_counted(integrator):
-    """energy_defect of the midpoint rule counts h d v^2 at the middle of each step, and forgets what is damped."""
-    case = zoo.ZOO["dampers"]
-    motion = motion_of(case, integrator, SIGNALS[0], 5)
-    rate = np.diff(motion.q, axis=0) / motion.dt
-    heat = np.cumsum(motion.dt * (rate**2 @ np.array([0.8, 0.5, 0.7])))
-    assert heat[-1] > 0.05
-    drift = np.abs(motion.energy[1:] - motion.energy[0] + heat)
-    np.testing.assert_allclose(motion.statistics.energy_defect, drift, rtol=0.1, atol=1e-11)
 
 
 @pytest.mark.parametrize("integrator", VARIATIONAL, ids=str)
@@ -773,14 +752,6 @@ def test_halves(case, integrator, signal):
     assert same(whole.part(0, k).q, whole.q[: k + 1])
     A = vp.linearize(case.scene, whole).A
     assert same(vp.linearize(case.scene, whole.part(k, 2 * k)).A, A[k:])
-
-
-def test_a_ringing_custom_force():
-    """A CustomForce that is faster than the step leaves a motion, with a warning, as a damper of the scene does."""
-    force = vp.CustomForce(lambda q, v: -40.0 * v, "complex")
-    scene, integrator = vp.Scene(vp.planar_chain(1), damping=0.0, forces=force), vp.Midpoint()
-    motion = vp.simulate(scene, [0.3], [2.0], dt=0.1, steps=8, integrator=integrator)
-    assert motion.warnings[0].kind == "error"
 
 
 @pytest.mark.parametrize("name", list(zoo.ZOO))

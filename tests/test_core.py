@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import gc
-
 import numpy as np
 import pinocchio as pin
 import pytest
+from oracles import slope
 from refusals import refused
 from test_border import of_mechanism
 
@@ -44,14 +43,12 @@ def test_many_jets_are_those_of_each_row(scene):
 
 def test_the_jet_along_a_direction_is_its_difference(scene):
     q, v, alpha, beta = rng.normal(size=(4, scene.robot.dof))
-    # Central differences of eighth order.
-    step, weights = 0.02, {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
-    expected = np.zeros((3, len(q), len(q)))
-    for k, c in weights.items():
-        for sign in (1.0, -1.0):
-            s = sign * k * step
-            _, _, _, Lqq, A, M = scene.core.jet(q + s * alpha, v + s * beta)
-            expected += sign * c / step * np.stack([M, A, Lqq])
+
+    def jets(s):
+        _, _, _, Lqq, A, M = scene.core.jet(q + s[0] * alpha, v + s[0] * beta)
+        return np.stack([M, A, Lqq])
+
+    expected = slope(jets, np.zeros(1), np.ones(1), 0.02)
     for ours, theirs in zip(scene.core.jets_along(q[None], v[None], alpha[None], beta[None]), expected, strict=True):
         assert np.abs(ours - theirs).max() <= 1e-9 * np.abs(theirs).max()
 
@@ -120,68 +117,23 @@ def test_where_a_mass_matrix_is_singular(method):
     assert nodes.ended.tolist() == [Outcome.solved, Outcome.solved, Outcome.singular, Outcome.solved]
 
 
-class TestRollouts:
-    @pytest.fixture
-    def scene(self):
-        return vp.Scene(vp.planar_chain(2))
-
-    def roll(self, rollout, nodes, commands=None, increments=None, drift=None):
-        commands = open_loop(np.zeros((nodes.q.shape[1], 2))) if commands is None else commands
-        nothing = np.zeros((0, 0, 0)), np.zeros((0, 0, 2))
-        rollout.roll(
-            1e-2,
-            commands,
-            nothing[0] if increments is None else increments,
-            nothing[1] if drift is None else drift,
-            nodes,
-        )
-
-    def test_a_copy_moves_by_itself_and_the_mechanism_stays(self):
-        # Nothing else holds the mechanism.
-        rollout = ExplicitRollout.start(
-            vp.Scene(vp.planar_chain(2)).core, ExplicitMethod.runge_kutta, np.ones((3, 2)), np.zeros((3, 2))
-        )
-        other = rollout.copy()
-        q, first = other.q, rollout.q.copy()
-        nodes, again = new_nodes(3, 5, 2, 2), new_nodes(3, 5, 2, 2)
-        self.roll(other, nodes)
-        assert np.array_equal(rollout.q, first)
-        self.roll(rollout, again)
-        assert np.array_equal(nodes.q, again.q)
-        assert np.array_equal(other.q, nodes.q[:, -1])
-        del other
-        gc.collect()
-        assert np.array_equal(q, nodes.q[:, -1])
-
-    def test_what_is_written_to_its_state_moves_it(self, scene):
-        one, other = (
-            ExplicitRollout.start(scene.core, ExplicitMethod.euler, np.ones((1, 2)), v) for v in np.eye(2)[:, None]
-        )
-        one.v[:] = other.v
-        nodes, expected = new_nodes(1, 1, 2, 2), new_nodes(1, 1, 2, 2)
-        self.roll(one, nodes)
-        self.roll(other, expected)
-        assert np.array_equal(nodes.v, expected.v)
-
-    @pytest.mark.parametrize(
-        ("change", "error", "facts"),
-        [
-            (lambda nodes: {"nodes": nodes._replace(q=nodes.q[:, :, ::-1])}, TypeError, "q"),
-            (lambda nodes: {"nodes": nodes._replace(done=nodes.done.astype(np.int32))}, TypeError, "done"),
-            (lambda nodes: {"commands": open_loop(np.zeros((4, 2)))._replace(hold=0)}, ValueError, "steps"),
-            (
-                lambda nodes: {"commands": open_loop(np.zeros((4, 2)))._replace(gains=np.zeros((4, 2, 3)))},
-                ValueError,
-                "column",
-            ),
-        ],
-    )
-    def test_what_does_not_fit_is_refused(self, scene, change, error, facts):
-        rollout = ExplicitRollout.start(scene.core, ExplicitMethod.euler, np.zeros((3, 2)), np.zeros((3, 2)))
-        given = {"nodes": new_nodes(3, 4, 2, 2)}
-        self.roll(rollout, **given)
-        with refused(error, facts):
-            self.roll(rollout, **(given | change(given["nodes"])))
+@pytest.mark.parametrize(
+    ("change", "error", "facts"),
+    [
+        ({"q": np.zeros((3, 4, 2))[:, :, ::-1]}, TypeError, "q"),
+        ({"done": np.zeros(3, dtype=np.int32)}, TypeError, "done"),
+        ({"hold": 0}, ValueError, "steps"),
+        ({"gains": np.zeros((4, 2, 3))}, ValueError, "column"),
+    ],
+)
+def test_what_no_rollout_takes_is_refused(change, error, facts):
+    still, nothing = np.zeros((3, 2)), (np.zeros((0, 0, 0)), np.zeros((0, 0, 2)))
+    commands, nodes = open_loop(np.zeros((4, 2))), new_nodes(3, 4, 2, 2)
+    rollout = ExplicitRollout.start(vp.Scene(vp.planar_chain(2)).core, ExplicitMethod.euler, still, still)
+    rollout.roll(1e-2, commands, *nothing, nodes)
+    own, other = ({key: change[key] for key in change if hasattr(part, key)} for part in (commands, nodes))
+    with refused(error, facts):
+        rollout.roll(1e-2, commands._replace(**own), *nothing, nodes._replace(**other))
 
 
 def test_matrices_beyond_the_range_of_indices_are_refused_before_there_is_room_for_them():

@@ -1,4 +1,4 @@
-"""Integrators as text: made again with all their options, from the record of a motion too."""
+"""Integrators as text, in the record of a motion too; what they refuse, and motions that run away."""
 
 import dataclasses
 
@@ -99,3 +99,37 @@ def test_what_made_a_motion_is_held_against_what_is_given():
     with refused(vp.InputError, "Own(alpha=0.5)", "integrator="):
         vp.linearize(scene, foreign)
     np.testing.assert_array_equal(vp.linearize(scene, foreign, integrator=Own()).A, vp.linearize(scene, motion).A)
+
+
+def test_the_reference_takes_no_noise():
+    noisy = vp.Scene(vp.load_robot("finger"), noise=vp.AdditiveNoise(1e-3))
+    with refused(vp.InputError, "noise"):
+        vp.simulate(noisy, np.zeros(3), np.zeros(3), dt=1e-3, steps=1, rng=0, integrator=vp.Reference())
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("rtol", 1e-15), ("rtol", 0.5), ("rtol", -1.0), ("atol", 0.0), ("rtol", "a")]
+)
+def test_tolerances_are_checked(name, value):
+    with refused(vp.InputError, name, repr(value)):
+        vp.Reference(**{name: value})
+
+
+def test_runaway_is_a_step_failure():
+    """Negative damping is not to be had, but a feedback of the wrong sign is."""
+    scene = vp.Scene(vp.planar_chain(1), gravity=False)
+    policy = vp.LinearPolicy(np.zeros((60, 1)), np.tile([[1e3, 1e3]], (60, 1, 1)), np.zeros((60, 2)))
+    with refused(vp.StepFailure) as caught:
+        vp.simulate(scene, [1.0], [1.0], dt=10.0, steps=60, controls=policy, integrator=vp.Reference())
+    assert np.isfinite(caught.value.trajectory.q).all()
+
+
+@pytest.mark.parametrize(
+    ("integrator", "damping", "dt"), [(vp.ExplicitEuler(), 0.0, 0.5), (vp.RungeKutta4(), 500.0, 0.05)], ids=str
+)
+def test_blow_up_is_a_step_failure(integrator, damping, dt):
+    scene = vp.Scene(vp.planar_chain(3), damping=damping)
+    with refused(vp.StepFailure, "runs away") as caught:
+        vp.simulate(scene, np.full(3, 0.4), np.zeros(3), dt=dt, steps=10_000, integrator=integrator)
+    assert "mass matrix" not in str(caught.value)
+    assert np.isfinite(caught.value.trajectory.energy).all()

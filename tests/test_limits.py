@@ -154,17 +154,6 @@ def test_a_heavy_wheel_does_not_hide_what_it_carries(dt):
     assert np.abs(np.array(energies) - energies[0]).max() < 0.1 * unit
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("dt", [0.01, 0.05, 0.2, 0.5])
-@pytest.mark.parametrize("links", [2, 3, 5])
-def test_chains_at_coarse_steps_keep_their_energy(links, dt):
-    scene = vp.Scene(vp.planar_chain(links))
-    motion = vp.simulate(scene, np.zeros(links), np.zeros(links), dt=dt, steps=100_000)
-    error = np.abs(motion.energy - motion.energy[0]) / (GRAVITY * links**2 / 2)
-    assert error.max() < 0.1
-    assert error.max() < 0.02 or motion.statistics.split_steps > 0
-
-
 def mixed_chain(rng, heavy, light):
     """Sliders and hinges about skew axes, the first ones ten thousand times as heavy as the others."""
     kinds = [pin.JointModelPX, pin.JointModelPY, pin.JointModelPZ, pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ]
@@ -219,21 +208,6 @@ def test_what_dies_out_away_from_zero_ends_at_rest(integrator, options, controls
     assert motion.q[-1, 0] == pytest.approx(end, abs=1e-14)
     assert abs(motion.v[-1, 0]) < 1e-13
     assert motion.statistics.split_steps == 0
-
-
-def test_chains_come_to_rest_on_springs_and_dampers():
-    rng = np.random.default_rng(5)
-    for _ in range(12):
-        n = int(rng.integers(1, 4))
-        scene = vp.Scene(
-            vp.planar_chain(n),
-            gravity=False,
-            stiffness=10.0 ** rng.uniform(0.0, 3.0, n),
-            damping=10.0 ** rng.uniform(0.5, 1.5, n),
-            rest=rng.uniform(-1.0, 1.0, n),
-        )
-        motion = vp.simulate(scene, np.zeros(n), np.zeros(n), dt=5e-3, steps=4000, check=False)
-        assert motion.statistics.substeps[3000:].max() == 1
 
 
 @pytest.mark.parametrize(("end", "words"), [(0.5, "its JointStop gives way"), (0.9, "nothing stops it there")])

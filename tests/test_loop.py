@@ -229,16 +229,34 @@ def test_noise_hides_nothing(kd, unstable):
     assert bool(told(run(scene, [0, 0], [0, 0], pd(300.0, kd), dt=1e-2, steps=200, rng=0))) == unstable
 
 
-@pytest.mark.parametrize(("kd", "unstable"), [(1.0, True), (40.0, False)])
-def test_a_four_bar(kd, unstable):
-    """The spring of a sampled law pumps energy in: within constraints as without."""
-    joint = vp.PointOnPoint("tip", (1.3, 0.0, 0.2), axes="xz")
-    scene = vp.Scene(vp.planar_chain(3), damping=0.05, constraints=joint, actuation=["joint1"])
-    goal = vp.assemble(scene, [-1.5, 1.5, 1.5])
-    start = vp.assemble(scene, goal + 0.02 * np.arange(1, 4))
-    law = pd(300.0, kd, goal[:1])
-    motion = run(scene, start, np.zeros(3), lambda t, q, v: law(t, q[:1], v[:1]), dt=1e-2, steps=80, period=2)
+LOOPS = {"four-bar": ((1.3, 0.0, 0.2), [-1.5, 1.5, 1.5], ["joint1"]),
+         "five-bar": ((1.6, 0.0, 0.3), [-1.0, 1.0, 1.0, 1.0], ["joint1", "joint4"])}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "kp", "kd", "steps", "unstable"),
+    [
+        ("four-bar", 300.0, 1.0, 800, True),
+        ("four-bar", 300.0, 40.0, 800, False),
+        ("five-bar", 30.0, 1.0, 800, False),
+        ("five-bar", 30.0, 160.0, 80, True),
+    ],
+)
+def test_closed_loops(name, kp, kd, steps, unstable):
+    """The spring of a sampled law pumps energy in, within constraints as without: the motion itself says whether."""
+    place, seed, driven = LOOPS[name]
+    joint = vp.PointOnPoint("tip", place, axes="xz")
+    scene = vp.Scene(vp.planar_chain(len(seed)), damping=0.05, constraints=joint, actuation=driven)
+    goal = vp.assemble(scene, seed)
+    start = vp.assemble(scene, goal + 0.02 * np.arange(1, len(seed) + 1))
+
+    def law(t, q, v):
+        return scene.actuation.T @ (kp * (goal - q) - kd * v)
+
+    motion = run(scene, start, np.zeros(len(seed)), law, dt=1e-2, steps=steps, period=2)
     assert bool(told(motion)) == unstable, motion.warnings
+    first, *_, last = np.array_split(np.abs(motion.v), 4)
+    assert (last.max() > first.max()) == unstable
 
 
 def test_policies():

@@ -64,11 +64,11 @@ MODELS = {
         lambda q, v, u, start: np.diag([0.6, 1.0, 2.0] * (q - CENTER) ** 2),
     ),
     "custom": (own_noise(), lambda q, v, u, start: 0.3 * (np.outer(q, q) + np.diag(v) + u[0])),
-    "sum": (
-        vp.AdditiveNoise(MATRIX) + own_noise() + vp.ControlNoise(0.4),
+    "list": (
+        [vp.AdditiveNoise(MATRIX), own_noise(), vp.ControlNoise(0.4)],
         lambda q, v, u, start: np.hstack([MATRIX, 0.3 * (np.outer(q, q) + np.diag(v) + u[0]), 0.4 * ACTUATION * u]),
     ),
-    "nested sum": (
+    "sum": (
         vp.StateNoise(0.6) + (vp.AdditiveNoise(0.7) + vp.ControlNoise(TABLE)),
         lambda q, v, u, start: np.hstack([np.diag(0.6 * (q - start) ** 2), np.diag([0.7] * 3), TABLE @ u]),
     ),
@@ -90,17 +90,6 @@ def test_fields_are_as_defined_and_have_their_derivatives(name):
     assert bound.velocity_dependent == (fields.Fv is not None) == bool(np.abs(Fv).max() > 0.1)
     if fields.Fv is not None:
         np.testing.assert_allclose(fields.Fv, Fv, rtol=0, atol=1e-12)
-
-
-def test_processes_of_several_models_stand_side_by_side():
-    parts = [vp.AdditiveNoise(MATRIX), vp.ControlNoise(0.4), vp.StateNoise(0.6)]
-
-    def fields(noise):
-        return vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=noise).noise.fields(*points()).F
-
-    singles = np.concatenate([fields(part) for part in parts], axis=2)
-    for several in (parts, tuple(parts), parts[0] + parts[1] + parts[2], [parts[0], parts[1] + parts[2]]):
-        np.testing.assert_array_equal(fields(several), singles)
 
 
 def test_state_noise_is_centred_on_the_start_of_the_motion():
@@ -249,16 +238,20 @@ def test_python_and_compiled_fields_give_the_same_motion(kick):
 @pytest.mark.parametrize(
     "integrator", [vp.Midpoint(), vp.Midpoint(kick="split"), vp.Midpoint(kick="held"), vp.Radau(2)]
 )
-def test_the_mean_of_noise_in_proportion_to_the_velocity(integrator):
+@pytest.mark.parametrize("dv", [True, False], ids=["Stratonovich", "Ito"])
+def test_the_mean_of_noise_in_proportion_to_the_velocity(integrator, dv):
     """Over two steps of the noise with the moments of a normal one: dv = s v o dw has the mean v exp(s^2 t / 2)."""
     M, s, dt = vp.lagrangian_jet(vp.Scene(vp.planar_chain(1)), [0.0], [0.0]).Lvv[0, 0], 0.3, 0.01
-    noise = vp.CustomNoise(lambda q, v, u: [[s * M * v[0]]], 1, dv=lambda q, v, u: [[[s * M]]])
+    noise = vp.CustomNoise(lambda q, v, u: [[s * M * v[0]]], 1, dv=(lambda q, v, u: [[[s * M]]]) if dv else None)
     scene = vp.Scene(vp.planar_chain(1), noise=noise, gravity=False)
     ends = [
         vp.simulate(scene, [0.5], [1.0], dt=dt, steps=1, integrator=integrator, increments=[[dw]], check=False).v[1, 0]
         for dw in (np.sqrt(dt), -np.sqrt(dt))
     ]
-    assert np.mean(ends) - 1.0 == pytest.approx(0.5 * s**2 * dt, rel=2e-3)
+    drift = 0.5 * s**2 * dt
+    # Half of a split kick has the field behind the step, which is half of the correction.
+    known = drift if dv else 0.5 * drift * (getattr(integrator, "kick", "") == "split")
+    assert np.mean(ends) - 1.0 == pytest.approx(known, rel=2e-3, abs=2e-3 * drift)
 
 
 def test_noise_of_controls_within_a_step_is_that_of_their_mean():

@@ -102,24 +102,6 @@ def test_a_plan_is_that_of_the_textbook(case):
     assert np.abs(ours.gains - plan.policy.feedback).max() <= 1e-3 * np.abs(plan.policy.feedback).max()
 
 
-def test_a_backward_pass_without_noise_is_riccatis():
-    # Of a linear arm, a slider on a spring, it is exact: one step of length 1 is the optimum.
-    model = pin.Model()
-    joint = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "slider")
-    model.appendBodyToJoint(joint, pin.Inertia(2.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
-    system = textbook.system(model, damping=0.3, stiffness=5.0)
-    cost = textbook.TrackingCost(lambda t: np.array([1.0]))
-    h, N = 0.05, 30
-    plan = textbook.solve(system, cost, np.zeros(1), np.zeros(1), np.zeros((N, 1)), h)
-    assert plan.iterations == 1
-    lin = textbook.linearize_step(system, np.zeros(1), np.zeros(1), np.zeros(1), h)
-    P, Q, R = np.diag([2.0, 0.0]), h * np.diag([20.0, 0.0]), np.array([[0.2 * h]])
-    for k in range(N - 1, -1, -1):
-        G = -np.linalg.solve(R + lin.B.T @ P @ lin.B, lin.B.T @ P @ lin.A)
-        assert plan.policy.feedback[k] == pytest.approx(G, rel=1e-9)
-        P = Q + lin.A.T @ P @ lin.A + lin.A.T @ P @ lin.B @ G
-
-
 def test_models_of_joints_with_two_variables_are_refused():
     model = pin.Model()
     model.addJoint(0, pin.JointModelRUBZ(), pin.SE3.Identity(), "continuous")

@@ -227,8 +227,9 @@ TIP = (1.3, 0.0, 0.2)
 FOUR, FIVE = {"q": (-1.5, 1.5, 1.5), "v": (1.0, 0.0, 0.0)}, {"q": (-1.0, 1.0, 1.0, 1.0), "v": 1.0}
 add("four-bar", chain(3, constraints=vp.PointOnPoint("tip", TIP, "xz")), **FOUR)
 add("five-bar", chain(4, damping=0.3, constraints=vp.PointOnPoint("tip", (1.6, 0.0, 0.3), "xz")), **FIVE)
-add("crank and block", lambda: vp.Scene(crank_and_slider(), constraints=vp.PointOnPoint("tip", "pin", "xz")),
-    (0.7, -0.9, 1.2), (3.0, 0.0, 0.0), 0.01)  # fmt: skip
+# With a row that nothing moves, and one that depends on others.
+TWICE = [vp.PointOnPoint("tip", "pin"), vp.PointOnPlane("tip", "pin", (1.0, 0.5, 1.0))]
+add("crank and block", lambda: vp.Scene(crank_and_slider(), constraints=TWICE), (0.7, -0.9, 1.2), (3.0, 0.0, 0.0), 0.01)
 add("rod", chain(3, constraints=vp.Distance("tip", (0.5, 0.0, 0.5), 1.2)), (-1.0, 0.6, 0.5), 1.0)
 add("cam", chain(3, constraints=vp.JointTie("joint3", "joint1", (0.1, 0.5, -0.3, 0.2))), (-1.0, 0.6, 0.5), 1.0)
 add("line", chain(3, constraints=vp.PointOnLine("tip", (1.0, 0.0, -0.4), (1.0, 0.0, 0.5))), (0.9, -1.1, 0.8), 1.0, 0.01)
