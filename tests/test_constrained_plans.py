@@ -1,11 +1,8 @@
 """Plans, controllers and choices of steps under constraints, against DOP853 on Pinocchio and differences."""
 
-import functools
-
 import numpy as np
 import pinocchio as pin
 import pytest
-from battery.loops import LOOPS
 from findings import about
 from oracles import exact, kkt
 from refusals import naming, refused
@@ -60,7 +57,6 @@ def test_a_linear_quadratic_plan_is_optimal_and_so_is_its_feedback():
 
 
 def five_bar(**options):
-    """Two driven cranks of 1 m whose rods meet: four joints, two degrees of freedom."""
     drives = np.zeros((4, 2))
     drives[0, 0] = drives[3, 1] = 1.0
     closed = vp.PointOnPoint("tip", (1.6, 0.0, 0.3), axes="xz")
@@ -141,26 +137,6 @@ def test_problems_of_closed_loops_take_an_integrator_that_keeps_them(fast):
 # --- choices of steps ------------------------------------------------------------------------------------------------
 
 
-@functools.cache
-def exact_loop(number, times=17):
-    """A loop without controls, a state in it, and its motion by DOP853 at 1e-12."""
-    loop = LOOPS[number]()
-    assert loop.controls is None
-    return loop, *loop.state(), loop.motion(times)[0]
-
-
-@pytest.mark.parametrize("number", [0, 13, 14])
-@pytest.mark.parametrize("tolerance", [1e-3, 1e-8])
-def test_tolerances_are_met(number, tolerance):
-    loop, q, v, truth = exact_loop(number)
-    motion = vp.simulate(loop.scene, q, v, duration=loop.duration, tolerance=tolerance)
-    assert {told.kind for told in motion.warnings} <= {"position limits", "velocity limits"}
-    assert motion.accuracy.met
-    off = np.abs(motion.q[-1] - truth[-1]).max()
-    assert off < max(tolerance, 1e-10)
-    assert off < 1.5 * motion.accuracy.error + 1e-10
-
-
 def test_of_a_start_off_the_constraints_it_is_said_that_it_was_moved(caplog):
     (scene, q), (other, _) = five_bar(), five_bar()
     motion = vp.simulate(scene, q + 1e-3, np.zeros(4), duration=0.2, tolerance=1e-6)
@@ -199,16 +175,6 @@ def test_work_and_precision_under_constraints():
     assert np.log2(coarse.error / fine.error) == pytest.approx(2.0, abs=0.3)
     with refused(vp.InputError, "RungeKutta4", "constraints"):
         vp.work_precision(scene, q, v, duration=0.4, integrators=[vp.RungeKutta4()])
-
-
-def test_advice_under_constraints():
-    loop, q, v, truth = exact_loop(13)
-    advice = vp.advise(loop.scene, q, v, duration=loop.duration, tolerance=1e-6)
-    assert advice.reached
-    motion = vp.simulate(
-        loop.scene, q, v, dt=advice.best.dt, steps=advice.best.steps, integrator=advice.best.integrator
-    )
-    assert np.abs(motion.q[-1] - truth[-1]).max() < 2e-6
 
 
 def test_plans_by_different_integrators():

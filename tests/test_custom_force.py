@@ -170,7 +170,6 @@ class TestWhereItFails:
         assert plan.cost < still.cost_of(still.simulate(np.zeros((10, 3))))
 
     def test_newton_names_it(self):
-        """A force that jumps leaves no solution of a step."""
         jumps = vp.CustomForce(lambda q, v: -200.0 * np.sign(v - 0.013))
         own = vp.Scene(ROBOT, gravity=False, forces=jumps)
         with refused(vp.StepFailure, "CustomForce <lambda>"):

@@ -23,7 +23,6 @@ def stopped():
 
 
 def test_stops_ahead():
-    """The choice at the start is ready for a stop that comes later, and a given integrator is taken."""
     scene, q0, v0, controls = stopped()
     options = {"dt": DT, "steps": STEPS, "controls": controls}
     usual = vp.simulate(scene, q0, v0, **options)
@@ -38,7 +37,6 @@ def test_stops_ahead():
 
 
 def test_a_stop_between_two_nodes():
-    """A joint that bounces off a stiff stop and back within a step."""
     stop = vp.JointStop(1e6, 500.0, **ENDS, width=1e-3)
     scene = vp.Scene(CHAIN, gravity=False, forces=[stop])
     # The nodes lie 0.005 rad before the stop and behind it.
@@ -55,7 +53,6 @@ def test_a_stiff_stop():
 
 
 def test_paths_without_noise_are_those_of_simulate():
-    """Of one start, and of many of which some ask for more."""
     scene, q0, v0, controls = stopped()
     options = {"dt": DT, "steps": STEPS, "controls": controls}
     alone = vp.simulate(scene, q0, v0, **options)

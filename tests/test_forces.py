@@ -23,7 +23,6 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_each_against_its_formula(name):
-    """Energy, forces and their derivatives at places before, in and beyond the rise of a stop."""
     robot, one = vp.planar_chain(1), np.ones(1)
     scene, bare = vp.Scene(robot, forces=CASES[name]), vp.Scene(robot)
     plain, drive = Mechanism(scene).forces, np.array([0.7])
@@ -214,7 +213,6 @@ def carrier():
 
 @pytest.mark.parametrize("ends", [("tip2", "tip0"), ("tip2", [0.5, 0.0, -0.8]), ("tip2", "tip1")])
 def test_light_parts_balance_with_springs(ends):
-    """A spring on a light part belongs to its balance: steps that resolve the motion stay whole."""
     robot = carrier()
     assert robot.tree.loads.size
     scene = vp.Scene(robot, forces=[vp.FrameSpring(*ends, 2.0), vp.FrameDamper(*ends, 0.002)])

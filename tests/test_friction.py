@@ -44,7 +44,6 @@ def test_friction_so_fast_that_steps_take_very_short_parts():
 
 
 def test_joints_that_do_not_stop_are_quiet():
-    """Friction far faster than the step where nothing comes to rest, and where nothing begins to move."""
     sliding = vp.simulate(block(1e-5, 0.1), [0.0], [2.0], dt=1e-2, steps=100)
     resting = vp.simulate(block(1e-5), [0.0], [0.0], dt=1e-2, steps=100)
     assert own(sliding) == own(resting) == []
@@ -108,7 +107,6 @@ def test_noise_beyond_the_width_of_friction_is_reported():
 
 
 def test_an_arm_comes_to_rest():
-    """All joints of an arm under friction that holds it, against SciPy; its energy never rises on the way."""
     robot = vp.load_robot("ur5")
     scene = vp.Scene(robot, gravity=False, forces=vp.CoulombFriction([8.0, 8.0, 5.0, 2.0, 2.0, 1.0], 1e-2))
     begin, speed = np.array([0.0, -1.2, 1.5, -0.5, 0.3, 0.2]), np.array([1.0, 1.0, -1.0, 1.0, 2.0, 2.0])

@@ -14,7 +14,6 @@ NAMES = ("Lq", "Lv", "Lqq", "Lvq", "Lvv")
 
 
 def busy_scene(robot: vp.Robot, rng: np.random.Generator) -> vp.Scene:
-    """Gravity in no special direction, a spring at every joint."""
     n = robot.dof
     return vp.Scene(
         robot, gravity=rng.normal(0.0, 6.0, 3), stiffness=rng.uniform(0.0, 3.0, n), rest=rng.uniform(-1.0, 1.0, n)
@@ -36,7 +35,6 @@ def naive_first(scene: vp.Scene, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarr
 
 
 def check_against_naive(scene: vp.Scene, q: np.ndarray, v: np.ndarray, directions: np.ndarray, backend: str) -> None:
-    """Everything in the jet; the second derivatives along ``directions`` (r, n)."""
     jet = vp.lagrangian_jet(scene, q, v, backend=backend)
     kinetic = 0.5 * v @ jet.Lvv @ v
     L = naive.lagrangian(scene, q, v)

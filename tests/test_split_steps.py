@@ -26,7 +26,6 @@ def parts_of(motion):
 
 
 def composed(scene, integrator, dt, halvings, q, p, u):
-    """(q1, p1) of plain steps without guards, one after another."""
     plain = type(integrator)(**{**vars(integrator), "guard": None})
     for level in halvings:
         step = vp.simulate(
@@ -77,7 +76,6 @@ def taken_otherwise(scene, motion, integrator):
 
 @each_case
 def test_parts_are_those_of_the_motion(name, integrator, seed):
-    """Plain steps of these lengths, one after another, lead from node to node."""
     scene, motion = moving(name, integrator, seed)
     assert motion.statistics.split_steps > 3
     parts = parts_of(motion)
@@ -112,7 +110,6 @@ def test_derivatives_are_those_of_the_parts_taken(name, integrator, seed):
 
 @pytest.mark.parametrize(("name", "integrator", "seed"), CASES[::3], ids=str)
 def test_second_derivatives_are_those_of_the_parts_taken(name, integrator, seed):
-    """Against differences of the first, the parts held."""
     scene, motion = moving(name, integrator, seed)
     k = next(taken_otherwise(scene, motion, integrator))
     step, n, rng = motion.part(k, k + 1), scene.robot.dof, np.random.default_rng(seed)

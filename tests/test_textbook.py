@@ -14,7 +14,6 @@ rng = np.random.default_rng(20)
 
 
 def pair(robot, *, noise=None, fields=textbook.no_noise, gravity=(0.0, 0.0, -9.81), **surroundings):
-    """The same arm as a scene and as a system of the textbook."""
     model = robot.model.copy()
     model.gravity = pin.Motion(np.array(gravity), np.zeros(3))
     scene = vp.Scene(robot, gravity=gravity, noise=noise, **surroundings)
@@ -52,16 +51,16 @@ def test_motions_and_linearizations_are_those_of_the_textbook(arm, alpha):
                 assert gap <= 1e-8 * np.abs(expected[part]).max(), (name, k)
 
 
-@pytest.mark.parametrize(
-    ("noise", "fields"),
-    [
-        (vp.AdditiveNoise(1e-2), textbook.white_noise(1e-2)),
-        (vp.ControlNoise(3e-2), textbook.control_noise(3e-2)),
-        (vp.StateNoise(5e-2), textbook.state_noise(5e-2, np.array([0.4, 0.1, -0.2]))),
-    ],
-    ids=["white", "control", "state"],
-)
-def test_noise_acts_as_in_the_textbook(noise, fields):
+NOISES = {
+    "white": (vp.AdditiveNoise(1e-2), textbook.white_noise(1e-2)),
+    "control": (vp.ControlNoise(3e-2), textbook.control_noise(3e-2)),
+    "state": (vp.StateNoise(5e-2), textbook.state_noise(5e-2, np.array([0.4, 0.1, -0.2]))),
+}
+
+
+@pytest.mark.parametrize("name", NOISES)
+def test_noise_acts_as_in_the_textbook(name):
+    noise, fields = NOISES[name]
     scene, system = pair(vp.planar_chain(3), noise=noise, fields=fields)
     q0, h, N = np.array([0.4, 0.1, -0.2]), 5e-3, 20
     u, dw = rng.normal(size=(N, 3)), np.sqrt(h) * rng.normal(size=(N, 3))
@@ -77,12 +76,9 @@ def test_noise_acts_as_in_the_textbook(noise, fields):
         assert np.abs((ends[0] - ends[1]) / 2e-2 - own.K @ own.F[:, i]).max() <= 1e-7 * np.abs(own.K).max()
 
 
-@pytest.mark.parametrize("case", ["white", "control"])
-def test_a_plan_is_that_of_the_textbook(case):
-    noise, fields = {
-        "white": (vp.AdditiveNoise(1e-2), textbook.white_noise(1e-2)),
-        "control": (vp.ControlNoise(2e-2), textbook.control_noise(2e-2)),
-    }[case]
+@pytest.mark.parametrize("name", ["white", "control"])
+def test_a_plan_is_that_of_the_textbook(name):
+    noise, fields = NOISES[name]
     scene, system = pair(vp.planar_chain(2), noise=noise, fields=fields, gravity=(0.0, 0.0, 0.0))
 
     def reference(t):

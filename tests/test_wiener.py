@@ -114,7 +114,6 @@ def oscillator():
 
 
 def map_of(scene, dt, integrator):
-    """The linear map of one step: A and G."""
     lin = vp.linearize(
         scene, vp.simulate(scene, [0.1], [0], dt=dt, steps=1, integrator=integrator), integrator=integrator
     )
