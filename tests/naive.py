@@ -33,17 +33,6 @@ def joint_axis(model: pin.Model, joint: int) -> tuple[bool, np.ndarray]:
     return kind.startswith("P"), AXES[kind[-1]]
 
 
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.stack(
-        [
-            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
-            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
-            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
-        ],
-        axis=-1,
-    )
-
-
 def rotation(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Rodrigues' formula, (..., 3, 3)."""
     K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
@@ -67,14 +56,14 @@ def energies(model: pin.Model, positions, rates, gravity) -> tuple[np.ndarray, n
             offset = offset + along * s[..., None]
             R.append(base)
             omega.append(omega[up])
-            speed.append(speed[up] + cross(omega[up], offset) + along * rate)
+            speed.append(speed[up] + np.cross(omega[up], offset) + along * rate)
         else:
             R.append(base @ rotation(axis, s))
             omega.append(omega[up] + along * rate)
-            speed.append(speed[up] + cross(omega[up], offset))
+            speed.append(speed[up] + np.cross(omega[up], offset))
         origin.append(origin[up] + offset)
         lever = R[joint] @ link.lever
-        at_center = speed[joint] + cross(omega[joint], lever)
+        at_center = speed[joint] + np.cross(omega[joint], lever)
         spin = np.einsum("...ji,...j->...i", R[joint], omega[joint])
         kinetic = kinetic + 0.5 * link.mass * (at_center**2).sum(-1) + 0.5 * (spin * (spin @ link.inertia)).sum(-1)
         potential = potential - link.mass * ((origin[joint] + lever) @ gravity)

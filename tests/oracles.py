@@ -88,11 +88,11 @@ class Mechanism:
         return found
 
     def place(self, q: np.ndarray, v: np.ndarray | None = None) -> None:
-        """Update every frame, its Jacobian and its acceleration at zero joint accelerations."""
-        rate = self.G @ (np.zeros(self.n) if v is None else v)
+        """Update every frame and its Jacobian; with ``v`` its acceleration at zero joint accelerations, too."""
         at = self.positions(q)
         pin.computeJointJacobians(self.model, self.data, at)
-        pin.forwardKinematics(self.model, self.data, at, rate, np.zeros(self.model.nv))
+        if v is not None:
+            pin.forwardKinematics(self.model, self.data, at, self.G @ v, np.zeros(self.model.nv))
         pin.updateFramePlacements(self.model, self.data)
 
     def point(self, end: object) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -102,7 +102,8 @@ class Mechanism:
             return np.asarray(end, float), np.eye(3), np.zeros((6, self.n)), np.zeros(6)
         f = self.model.getFrameId(name)
         R, x = self.data.oMf[f].rotation.copy(), self.data.oMf[f].translation.copy()
-        J = pin.getFrameJacobian(self.model, self.data, f, WORLD) @ self.G
+        # Of one joint the bindings drop an axis.
+        J = pin.getFrameJacobian(self.model, self.data, f, WORLD).reshape(6, -1) @ self.G
         a = pin.getFrameClassicalAcceleration(self.model, self.data, f, WORLD).vector.copy()
         w = pin.getFrameVelocity(self.model, self.data, f, WORLD).angular
         r = R @ np.asarray(shift, float)
@@ -123,7 +124,7 @@ class Mechanism:
         for own in self.scene.forces:
             if isinstance(own, vp.FrameSpring | vp.FrameDamper | vp.FrameWrench):
                 if not placed:
-                    self.place(q, v)
+                    self.place(q)
                     placed = True
                 energy, of_energy, other = self._frame_force(own, v)
                 V, pull, rest = V + energy, pull + of_energy, rest + other
@@ -283,8 +284,9 @@ def exact(
     *,
     path: Path | None = None,
     stiff: bool = False,
+    rtol: float | None = None,
 ) -> Motion:
-    """The continuous motion at ``times``, by DOP853 or, stiff, by SciPy's Radau.
+    """The continuous motion at ``times``, by DOP853 to 1e-12 or, stiff, by SciPy's Radau to 1e-11.
 
     Between times k and k + 1 the controls are the function of time that ``signal(k, q, v)`` returns at the state of
     time k: rows, laws and policies are constant over an interval, open loops are not. None holds servos at ``q0``.
@@ -305,8 +307,9 @@ def exact(
             _, pull, rest = own.forces(q, v, resting if force is None else scene.actuation @ force(t))
             return np.concatenate([v, own.acceleration(t, q, v, pull + rest), [v @ rest]])
 
-        method, rtol = ("Radau", 1e-11) if stiff else ("DOP853", 1e-12)
-        x = solve_ivp(rate, (begin, end), x, method, rtol=rtol, atol=1e-3 * rtol).y[:, -1]
+        method, usual = ("Radau", 1e-11) if stiff else ("DOP853", 1e-12)
+        share = rtol or usual
+        x = solve_ivp(rate, (begin, end), x, method, rtol=share, atol=1e-3 * share).y[:, -1]
         rows.append(x)
     y = np.array(rows)
     q, v = y[:, :n], y[:, n : 2 * n]

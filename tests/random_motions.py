@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from oracles import Mechanism
 from scipy import integrate, optimize
 
 import varpin as vp
@@ -44,7 +45,6 @@ class Case(NamedTuple):
     steps: int
     integrator: vp.Integrator | None
     controls: object
-    formulas: list  # forces (n,) at q, v under controls u
     jumps: Array  # instants at which controls of time alone jump [s]
     rate: float  # of the fastest damping [1/s]
 
@@ -92,85 +92,49 @@ def any_robot(rng: np.random.Generator) -> vp.Robot:
     return robot
 
 
-# A robot by Pinocchio's own calls, in the coordinates of ``joint_names``.
-class Plain:
-    def __init__(self, robot: vp.Robot, gravity: Array) -> None:
-        self.model, self.n, self.data = robot.model.copy(), robot.dof, robot.model.createData()
-        self.model.gravity.linear = gravity
-        self.tip = self.model.getFrameId(robot.end_effector)
-        self.place = robot.configuration if self.model.nq > self.n else lambda q: q
-
-    def weight(self, q: Array) -> Array:
-        return np.array(pin.computeGeneralizedGravity(self.model, self.data, self.place(q)))
-
-    def point(self, q: Array) -> tuple[Array, Array]:
-        """The place (3,) of ``AT`` in the last frame and its Jacobian (3, n), along the world's axes."""
-        J = pin.computeFrameJacobian(self.model, self.data, self.place(q), self.tip, pin.LOCAL_WORLD_ALIGNED)
-        pin.framesForwardKinematics(self.model, self.data, self.place(q))
-        here, J = self.data.oMf[self.tip], J.reshape(6, self.n)
-        return here.act(AT), J[:3] - pin.skew(here.rotation @ AT) @ J[3:]
-
-    def pull(self, q: Array, k: float, anchor: Array) -> Array:
-        x, J = self.point(q)
-        return k * J.T @ (anchor - x)
-
-
-def stop(depth: Array, rate: Array, k: Array, d: Array, width: Array) -> Array:
-    """The force out of a stop at a depth that changes at a rate."""
-    y = np.clip(depth / width, 0.0, 1.0)
-    return k * (width * (y**3 - 0.5 * y**4) + np.maximum(depth - width, 0.0)) + d * (3.0 - 2.0 * y) * y**2 * rate
-
-
-def drive(wanted: Array, effort: Array) -> Array:
-    """The force of a drive that bends from 0.9 of its effort on."""
-    share, side = np.abs(wanted) / effort, np.sign(wanted)
-    return wanted - side * effort * (2.5 * np.clip(share - 0.9, 0.0, 0.2) ** 2 + np.maximum(share - 1.1, 0.0))
-
-
 def draw(seed: int) -> Case:
     """The task of a seed, whose kind follows from the seed, too."""
     rng, kind = np.random.default_rng(seed), KINDS[seed % len(KINDS)]
     robot, gravity = any_robot(rng), np.array([0.0, 0.0, -9.81]) * (kind == "upright" or rng.random() < 0.7)
-    plain, n, unit = Plain(robot, gravity), robot.dof, np.where(robot.slides, 0.3, 1.0)
+    free, n, unit = vp.Scene(robot, gravity=gravity, damping=0.0), robot.dof, np.where(robot.slides, 0.3, 1.0)
     dt = float(log_uniform(rng, 1e-3, 0.05))
     steps = max(4, round(rng.uniform(0.2, 2.0) / dt))
     q0, v0 = unit * rng.uniform(-1.5, 1.5, n), unit * rng.normal(size=n) * log_uniform(rng, 0.05, 5.0)
     v0 *= kind == "free" or rng.random() >= 0.3
     if kind == "upright":  # With sliding joints there may be no equilibrium: they fall.
-        q0 = optimize.least_squares(plain.weight, q0, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+        q0 = optimize.least_squares(free.holding_torque, q0, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
         q0, v0 = q0 + log_uniform(rng, 1e-8, 0.03) * rng.normal(size=n), np.zeros(n)
-    inverse = np.array(pin.computeMinverse(plain.model, plain.data, plain.place(q0))).reshape(n, n)
-    weight, parts = plain.weight(q0), {kind}
+    plain = Mechanism(free)
+    inverse, weight, parts = np.linalg.inv(plain.mass_matrix(q0)), free.holding_torque(q0), {kind}
     inertia = 1.0 / np.diag(inverse)
     push = inertia * unit * log_uniform(rng, 3.0, 200.0)
     if kind == "mixed":
         pair = rng.choice(["dampers", "springs", "frames", "stops", "friction"], 2, replace=False)
         parts = {rng.choice(["torques", "smooth", "laws"]), *pair}
-    forces, damping, jumps, controls = {}, np.zeros(n), np.zeros(0), None
+    forces, damping, jumps, controls = [], np.zeros(n), np.zeros(0), None
     if "dampers" in parts or (kind not in ("free", "upright") and rng.random() < 0.25):
         rate = log_uniform(rng, 0.01, 100.0) / dt if "dampers" in parts else log_uniform(rng, 0.1, 5.0)
-        damping = light = rate * inertia * log_uniform(rng, 0.3, 1.0, n)
-        forces[vp.JointDamper(light)] = lambda q, v, u: -light * v
+        damping = rate * inertia * log_uniform(rng, 0.3, 1.0, n)
+        forces.append(vp.JointDamper(damping))
     if "springs" in parts:
         turn = (log_uniform(rng, 0.01, 3.0) / dt) ** 2 * inertia * log_uniform(rng, 0.3, 1.0, n)
-        rest = q0 + 0.2 * rng.normal(size=n)
-        forces[vp.JointSpring(turn, rest)] = lambda q, v, u: -turn * (q - rest)
+        forces.append(vp.JointSpring(turn, q0 + 0.2 * rng.normal(size=n)))
     if "frames" in parts:
-        x, J = plain.point(q0)
+        plain.place(q0)
+        x, _, J, _ = plain.point((robot.end_effector, AT))
         anchor, omega = x + 0.1 * rng.normal(size=3), min(300.0, log_uniform(rng, 0.01, 2.0) / dt)
-        stiff = omega**2 / np.linalg.norm(J @ inverse @ J.T, 2)
-        forces[vp.FrameSpring((robot.end_effector, AT), anchor, stiff)] = lambda q, v, u: plain.pull(q, stiff, anchor)
+        stiff = omega**2 / np.linalg.norm(J[:3] @ inverse @ J[:3].T, 2)
+        forces.append(vp.FrameSpring((robot.end_effector, AT), anchor, stiff))
     if "friction" in parts:
         level, width = push * rng.uniform(0.05, 0.5), unit * log_uniform(rng, 0.01, 0.1)
         damping = damping + level / width
-        forces[vp.CoulombFriction(level, width)] = lambda q, v, u: -level * np.tanh(v / width)
+        forces.append(vp.CoulombFriction(level, width))
     if "stops" in parts:
         lower, upper = (q0 + side * unit * rng.uniform(0.02, 0.4, n) for side in (-1.0, 1.0))
         hard, wide = inertia * log_uniform(rng, 30.0, 1000.0) ** 2, unit * log_uniform(rng, 0.003, 0.05)
         soft = 2.0 * rng.uniform(0.0, 1.0) * np.sqrt(hard * inertia)
         damping, v0 = damping + soft, v0 + unit * rng.normal(size=n)
-        own, ends = (hard, soft, wide), vp.JointStop(hard, soft, lower, upper, wide)
-        forces[ends] = lambda q, v, u: stop(lower - q, -v, *own) - stop(q - upper, v, *own)
+        forces.append(vp.JointStop(hard, soft, lower, upper, wide))
     pace, swing, phase = rng.uniform(1.0, 20.0, n), push * rng.normal(size=n), rng.uniform(0.0, 6.3, n)
     mean, every = weight * (rng.random() < 0.5), int(rng.choice([1, 1, 2, 5, 20, steps]))
     rows = rng.normal(size=(steps, n))[np.arange(steps) // every * every]
@@ -179,9 +143,9 @@ def draw(seed: int) -> Case:
         d, way = 2.0 * rng.uniform(0.1, 2.0) * np.sqrt(k * inertia), unit * log_uniform(rng, 0.03, 1.0)
         effort = (np.abs(weight) + push) * rng.uniform(0.3, 2.0) if rng.random() < 0.5 else np.full(n, np.inf)
         damping = damping + d
-        forces[vp.PositionServo(k, d, effort)] = lambda q, v, u: drive(k * (u - q) - d * v, np.minimum(effort, 1e12))
+        forces.append(vp.PositionServo(k, d, effort))
         controls = vp.OpenLoop(lambda t: q0 + way * np.sin(pace * t)) if rng.random() < 0.3 else q0 + way * rows
-    scene = vp.Scene(robot, gravity=gravity, forces=list(forces), damping=0.0, friction=0.0)
+    scene = vp.Scene(robot, gravity=gravity, forces=forces, damping=0.0, friction=0.0)
     if "torques" in parts:
         controls = mean + push * rows
     if "smooth" in parts:
@@ -198,13 +162,12 @@ def draw(seed: int) -> Case:
         controls = lambda t, q, v: kp * (aim - q) - kd * v + scene.holding_torque(q)  # noqa: E731
     rate = float(np.linalg.eigvalsh(np.sqrt(damping)[:, None] * inverse * np.sqrt(damping)).max())
     integrator = None if rng.random() < 2.0 / 3.0 else METHODS[rng.integers(len(METHODS))]
-    formulas = [*forces.values(), *([] if "servos" in parts else [lambda q, v, u: u])]
-    return Case(seed, kind, scene, q0, v0, dt, steps, integrator, controls, formulas, jumps, rate)
+    return Case(seed, kind, scene, q0, v0, dt, steps, integrator, controls, jumps, rate)
 
 
 def run(case: Case, given: object, rtol: float) -> Array:
     """q and v (2, N + 1, n) at nodes, by SciPy on Pinocchio's aba, begun anew wherever the ``given`` controls jump."""
-    plain, n, times = Plain(case.scene.robot, case.scene.gravity), case.q0.size, case.dt * np.arange(case.steps + 1)
+    plain, n, times = Mechanism(case.scene), case.q0.size, case.dt * np.arange(case.steps + 1)
     law, rows, end, calls = callable(given), isinstance(given, np.ndarray), times[-1], itertools.count()
     borders = times if law else np.unique(np.clip([0.0, *case.jumps, end], 0.0, end))
     if rows:
@@ -220,8 +183,9 @@ def run(case: Case, given: object, rtol: float) -> Array:
                 raise ArithmeticError
             # Of controls that jump at an end, the side within.
             u = given.f(t + 1e-12 * (ends - 2.0 * t)) if isinstance(given, vp.OpenLoop) else row
-            force = sum(formula(case.q0 + x[:n], x[n:], u) for formula in case.formulas)
-            return np.append(x[n:], pin.aba(plain.model, plain.data, plain.place(case.q0 + x[:n]), x[n:], force))
+            q, v = case.q0 + x[:n], x[n:]
+            _, pull, others = plain.forces(q, v, case.scene.actuation @ u)
+            return np.append(v, plain.acceleration(t, q, v, pull + others))
 
         inside = times[(times > begin + 1e-9 * case.dt) & (times < end - 1e-9 * case.dt)]
         found = integrate.solve_ivp(slope, (begin, end), x, method, np.append(inside, end), rtol=rtol, atol=1e-4 * rtol)
@@ -237,7 +201,8 @@ def truth(case: Case, cache: Path | None = None) -> Truth | None:
     """The true motion, a law called with its states. None: unknown."""
     given, q0, v0 = case.controls, case.q0, case.v0
     now = given.f(case.dt) if isinstance(given, vp.OpenLoop) else given(0.0, q0, v0) if callable(given) else given
-    probe = [q0, v0, case.dt, case.steps, *(f(q0, v0, v0) for f in case.formulas), 0.0 if now is None else now]
+    acting = Mechanism(case.scene).forces(q0, v0, v0)
+    probe = [q0, v0, case.dt, case.steps, *acting, 0.0 if now is None else now]
     key = hashlib.sha1(np.round(np.concatenate(probe, axis=None), 9).tobytes()).hexdigest()[:12]
     file = None if cache is None else cache / f"{case.seed}_{key}.npz"
     if file is not None and file.exists():

@@ -7,12 +7,13 @@ held against reading and writing past an array's end, too.
 import threading
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from refusals import refused
 
 import varpin as vp
 from varpin import core
-from varpin.core.arrays import Commands, RolloutArrays, new_nodes
+from varpin.core.arrays import Commands, ConstraintRows, RolloutArrays, new_nodes
 from varpin.integrators.tableau import gauss_coefficients, lobatto_places
 from varpin.signals.commands import interpolation, open_loop
 
@@ -31,7 +32,6 @@ def draw(*shape):
 
 
 def scene():
-    """Branches, a slider, a mimic joint: a hand's two fingers would do, a gripper on an arm does."""
     return vp.Scene(vp.load_robot("panda"), damping=0.1, noise=NOISE, actuation=draw(8, 3))
 
 
@@ -126,7 +126,6 @@ def steps(scene):
 
 
 def cost_terms(links, n, m):
-    """A term on each subject."""
     costs = core.CostTerms.make(n, m)
     frame, center = costs.add_frame(links, np.eye(3), draw(3)), costs.add_center(links)
     none, subject = np.zeros(0, dtype=np.int64), core.Subject
@@ -141,7 +140,6 @@ def cost_terms(links, n, m):
 
 
 def of_backward(n, m, k=2):
-    """Arguments of a pass over N steps, with what it writes."""
     x, R = 2 * n, N // 2
     given = {"A": draw(N, x, x), "B": draw(N, x, m), "G": draw(N, x, k), "Gx": draw(N, x, k, x), "Gu": draw(N, x, k, m)}
     given |= {"gradient": draw(N, x + m), "hessian": np.tile(np.eye(x + m), (N, 1, 1)), "end": draw(x)}
@@ -156,7 +154,6 @@ def backward(end, **arrays):
 
 
 def calls():
-    """By name, what is called and arguments that fit."""
     own = scene()
     n, m = own.robot.dof, own.controls
     state, states = {"q": draw(n), "v": draw(n)}, {"q": draw(N, n), "v": draw(N, n)}
@@ -242,26 +239,29 @@ def test_what_does_not_fit_is_refused(every, change):
     assert taken == []
 
 
-@pytest.mark.parametrize("halvings", [-1, 63])
-def test_halvings_that_cannot_be_counted_are_refused(halvings):
-    with refused(ValueError, "halvings", "62"):
-        core.Guards.make(**{**GUARDS, "most_halvings": halvings})
-
-
-@pytest.mark.parametrize("rate", [-2, 1])
-def test_rates_that_are_no_controls_are_refused(rate):
+def with_rate(rate):
     own = vp.Scene(vp.planar_chain(1), constraints=vp.KinematicInput("joint1"))
     rows = own.bound_constraints.rows
     rows = rows._replace(ties=tuple(tie._replace(rate=rate) for tie in rows.ties))
-    with refused(ValueError, "control"):
-        core.Mechanism.make(**of_mechanism(own) | {"constraints": rows})
+    return core.Mechanism.make(**of_mechanism(own) | {"constraints": rows})
 
 
-@pytest.mark.parametrize("level", [0, 63])
-def test_parts_that_no_step_has_are_refused(level):
-    given = {**steps(scene()), "halvings": np.array([1, 1, 2, 2, 2, level], dtype=np.uint8)}
-    with refused(ValueError, "halvings", "62"):
-        core.Steps(**given)
+def with_level(level):
+    return core.Steps(**{**steps(scene()), "halvings": np.array([1, 1, 2, 2, 2, level], dtype=np.uint8)})
+
+
+@pytest.mark.parametrize(
+    ("make", "values", "facts"),
+    [
+        (lambda most: core.Guards.make(**{**GUARDS, "most_halvings": most}), (-1, 63), ("halvings", "62")),
+        (with_rate, (-2, 1), "control"),
+        (with_level, (0, 63), ("halvings", "62")),
+    ],
+)
+def test_numbers_that_cannot_be_are_refused(make, values, facts):
+    for value in values:
+        with refused(ValueError, facts):
+            make(value)
 
 
 @pytest.mark.parametrize("path", [-1, P])
@@ -285,3 +285,89 @@ def test_two_threads_in_forks_of_one_rollout_are_refused():
     thread.join()
     assert nodes.done == 50_000
     other.kick(np.zeros((1, 3)))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "facts"),
+    [
+        ("parent", [-1, 1], "parents"),
+        ("coordinate", [0, 2], "coordinate"),
+        ("group", [0, 3], "group"),
+        ("mass", [1.0], ("mass", "1")),
+        ("ends", [1], "block"),
+        ("ends", [3], "blocks"),
+        ("loads", [0], ("carried", "0", "1")),
+    ],
+)
+def test_what_is_no_tree_is_refused(field, value, facts):
+    own = of_mechanism(vp.Scene(vp.planar_chain(2)))
+    own[field] = np.array(value, dtype=np.asarray(own[field]).dtype)
+    with refused(ValueError, facts):
+        core.Mechanism.make(**own)
+
+
+def sliding():
+    """A slider on a turning axis, a point mass: about the axis it has no inertia where it stands on it."""
+    model = pin.Model()
+    turns = model.addJoint(0, pin.JointModelRZ(), pin.SE3.Identity(), "turns")
+    slides = model.addJoint(turns, pin.JointModelPX(), pin.SE3(np.eye(3), np.array([0.5, 0.0, 0.0])), "slides")
+    model.appendBodyToJoint(slides, pin.Inertia(1.0, np.zeros(3), np.zeros((3, 3))), pin.SE3.Identity())
+    return vp.Scene(vp.load_robot(model))
+
+
+@pytest.mark.parametrize("method", core.ExplicitMethod)
+def test_where_a_mass_matrix_is_singular(method):
+    scene = sliding()
+    at = np.array([[0.0, 1.0], [0.0, 2.0], [0.0, -0.5], [0.0, 1.0]])
+    nothing = np.zeros_like(at)
+    assert core.accelerations(scene.core, at, nothing, nothing)[-1] == 2
+    assert core.linearize_explicit(scene.core, method, 1e-3, at, nothing, nothing[:, None])[-1] == 2
+    nodes = new_nodes(4, 3, 2, 2)
+    assert not core.ExplicitRollout.start(scene.core, method, at, nothing).first_nodes(nodes)
+    core.ExplicitRollout.start(scene.core, method, at, nothing).roll(
+        1e-3, open_loop(np.zeros((3, 2))), np.zeros((0, 0, 0)), np.zeros((0, 0, 2)), nodes
+    )
+    assert nodes.done.tolist() == [3, 3, 0, 3]
+    ends = core.Outcome.solved, core.Outcome.singular
+    assert nodes.ended.tolist() == [ends[0], ends[0], ends[1], ends[0]]
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "facts"),
+    [
+        ({"q": np.zeros((3, 4, 2))[:, :, ::-1]}, TypeError, "q"),
+        ({"done": np.zeros(3, dtype=np.int32)}, TypeError, "done"),
+        ({"hold": 0}, ValueError, "steps"),
+        ({"gains": np.zeros((4, 2, 3))}, ValueError, "column"),
+    ],
+)
+def test_what_no_rollout_takes_is_refused(change, error, facts):
+    still, nothing = np.zeros((3, 2)), (np.zeros((0, 0, 0)), np.zeros((0, 0, 2)))
+    commands, nodes = open_loop(np.zeros((4, 2))), new_nodes(3, 4, 2, 2)
+    rollout = core.ExplicitRollout.start(vp.Scene(vp.planar_chain(2)).core, core.ExplicitMethod.euler, still, still)
+    rollout.roll(1e-2, commands, *nothing, nodes)
+    own, other = ({key: change[key] for key in change if hasattr(part, key)} for part in (commands, nodes))
+    with refused(error, facts):
+        rollout.roll(1e-2, commands._replace(**own), *nothing, nodes._replace(**other))
+
+
+def test_matrices_beyond_the_range_of_indices_are_refused_before_there_is_room_for_them():
+    """A chain of 50 000 joints has mass matrices of more than 2^31 numbers; what needs none of them runs."""
+    n, link = 50_000, vp.planar_chain(1).tree
+    own = {name: np.repeat(getattr(link, name), n, axis=0) for name in (
+        "prismatic", "rotation", "translation", "mass", "center", "inertia", "ratio", "offset", "periodic", "armature",
+        "group",
+    )}  # fmt: skip
+    own |= {"parent": np.arange(-1, n - 1), "coordinate": np.arange(n), "origin": np.repeat([1, 0], [1, n - 1])}
+    own |= {"loads": np.zeros(0, dtype=np.int64), "carried": np.zeros((0, n), dtype=np.int64), "ends": np.array([n])}
+    own |= {"actuation": np.zeros((n, 0)), "constant": np.zeros((n, 0)), "control": np.zeros((n, 0, 0))}
+    own |= {"quadratic": np.zeros((n, 0)), "centers": np.zeros((n, 0))}
+    own |= {"forces": [], "couplings": [], "constraints": ConstraintRows(), "custom": None}
+    chain = core.Mechanism.make(**own, groups=1, gravity=np.zeros(3))
+    still = np.zeros((1, n))
+    step = (vp.Midpoint()._tableau(), 0.5, vp.Midpoint()._guards())
+    assert core.Rollout(chain, *step, 1.0, 1).begin(still, still)
+    with refused(ValueError, "matrix"):
+        core.Rollout(chain, vp.Gauss(2)._tableau(), *step[1:], 1.0, 1)
+    with refused(ValueError, "matrix"):
+        chain.jet(still[0], still[0])

@@ -1,8 +1,9 @@
-"""Plans, ensembles and controllers of scenes with constraints: a dense KKT solve, SciPy, and simulations."""
+"""Plans, controllers and choices of steps under constraints, against DOP853 on Pinocchio and differences."""
 
 import numpy as np
 import pinocchio as pin
 import pytest
+from findings import about
 from oracles import exact, kkt
 from refusals import naming, refused
 
@@ -56,7 +57,6 @@ def test_a_linear_quadratic_plan_is_optimal_and_so_is_its_feedback():
 
 
 def five_bar(**options):
-    """Two driven cranks of 1 m whose rods meet: four joints, two degrees of freedom."""
     drives = np.zeros((4, 2))
     drives[0, 0] = drives[3, 1] = 1.0
     closed = vp.PointOnPoint("tip", (1.6, 0.0, 0.3), axes="xz")
@@ -64,15 +64,12 @@ def five_bar(**options):
     return scene, vp.assemble(scene, [-1.0, 1.0, 1.0, 1.0])
 
 
-def reach(integrator=None, limits=None, **options):
+def reach(integrator=None, **options):
     scene, q0 = five_bar(**options)
     goal = vp.assemble(scene, q0 + 0.3 * np.eye(4)[0])
     cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost(goal, 1e3) + vp.VelocityCost(10.0))
     still = np.zeros(4)
-    problem = vp.OptimalControlProblem(
-        scene, cost, q0, still, dt=0.02, steps=50, integrator=integrator, control_limits=limits
-    )
-    return problem, goal
+    return vp.OptimalControlProblem(scene, cost, q0, still, dt=0.02, steps=50, integrator=integrator), goal
 
 
 def test_a_five_bar_reaches_from_a_cold_start_and_holds():
@@ -94,23 +91,6 @@ def test_a_five_bar_reaches_from_a_cold_start_and_holds():
     assert np.abs(np.einsum("kmn,kn->km", C, plan.trajectory.v)).max() < 1e-12
 
 
-def test_plans_keep_torque_limits_and_gradients_are_those_of_the_rollout():
-    problem, _ = reach(vp.Midpoint(), (-80.0, 80.0))
-    plan = vp.solve(problem, check=False)
-    assert plan.status.converged
-    assert np.abs(plan.trajectory.u).max() == 80.0
-    # The gradient at some other controls, against differences of the cost.
-    u = np.tile(problem.holding_controls(), (50, 1)) + np.random.default_rng(0).normal(size=(50, 2))
-    there = vp.solve(problem.at(), u, max_iterations=0, check=False)
-    for k, c in ((0, 0), (7, 1), (49, 0)):
-        costs = []
-        for sign in (1.0, -1.0):
-            moved = u.copy()
-            moved[k, c] += sign * 1e-3
-            costs.append(problem.cost_of(problem.simulate(moved)))
-        assert there.gradient[k, c] == pytest.approx((costs[0] - costs[1]) / 2e-3, rel=1e-6)
-
-
 def test_plans_begin_on_the_constraints(caplog):
     scene, q0 = five_bar()
     cost = vp.ControlCost(1.0)
@@ -124,35 +104,10 @@ def test_plans_begin_on_the_constraints(caplog):
         problem.at(q0=q0 + 0.3)
 
 
-def test_an_ensemble_under_a_plan_is_what_its_model_says():
-    """Mean and covariance of the closed loop, in closed form and by simulation, and the expected cost."""
+def test_noise_costs_what_the_plan_says():
     problem, _ = reach(vp.Midpoint(), noise=vp.AdditiveNoise(0.05))
-    plan = vp.solve(problem, check=False)
-    scene, steps, dt = problem.scene, problem.steps, problem.dt
-    paths = vp.simulate_ensemble(
-        scene,
-        problem.q0,
-        problem.v0,
-        dt=dt,
-        steps=steps,
-        paths=500,
-        rng=0,
-        controls=plan.policy,
-        integrator=problem.integrator,
-        store=False,
-    )
-    lin = vp.linearize(scene, plan.trajectory)
-    P = np.zeros((8, 8))
-    for k in range(steps):
-        A = lin.A[k] + lin.B[k] @ plan.gains[k]
-        P = A @ P @ A.T + dt * lin.G[k] @ lin.G[k].T
-    deviation = np.sqrt(np.diag(P))
-    found = paths.statistics
-    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance[-1])), deviation, rtol=0.13)
-    center = np.append(plan.trajectory.q[-1], plan.trajectory.p[-1])
-    assert (np.abs(found.mean[-1] - center) < 5.0 * deviation / np.sqrt(500)).all()
-    by_moments = plan.monte_carlo(300, rng=1)
-    assert abs(by_moments.cost - by_moments.predicted) < 4.0 * by_moments.standard_error
+    paths = vp.solve(problem, check=False).monte_carlo(300, rng=1)
+    assert abs(paths.cost - paths.predicted) < 4.0 * paths.standard_error
 
 
 def test_a_controller_keeps_a_closed_loop_on_its_way():
@@ -177,3 +132,54 @@ def test_problems_of_closed_loops_take_an_integrator_that_keeps_them(fast):
     motion = vp.simulate(scene, q0, np.zeros(4), dt=0.05, steps=4, integrator=problem.integrator)
     assert np.abs(scene.core.constraints(motion.q)[0]).max() < 1e-12
     assert not any("Radau" in sentence for sentence in motion.warnings)
+
+
+# --- choices of steps ------------------------------------------------------------------------------------------------
+
+
+def test_of_a_start_off_the_constraints_it_is_said_that_it_was_moved(caplog):
+    (scene, q), (other, _) = five_bar(), five_bar()
+    motion = vp.simulate(scene, q + 1e-3, np.zeros(4), duration=0.2, tolerance=1e-6)
+    assert about(motion.warnings, "start off the constraints")
+    caplog.clear()
+    vp.advise(other, q + 1e-3, np.zeros(4), duration=0.1, tolerance=1e-3)
+    assert about(caplog.messages, "start off the constraints")
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_a_tolerance_beside_a_joint_that_is_moved_by_hand_keeps_its_path(interpolation):
+    hand = vp.KinematicInput("joint1", interpolation)
+    scene = vp.Scene(vp.planar_chain(3), actuation=["joint1"], constraints=hand)
+    t = np.linspace(0.0, 1.0, 9)[1:]
+    u = np.column_stack([0.5 * (1.0 - np.cos(3.0 * t)), 1.5 * np.sin(3.0 * t)])[:, : scene.controls]
+    start = np.array([0.0, 1.5, 0.0]), np.zeros(3)
+    motion = vp.simulate(scene, *start, duration=1.0, tolerance=1e-7, controls=u)
+    assert motion.accuracy.met
+    np.testing.assert_allclose(motion.q[:: motion.steps // 8][1:, 0], u[:, 0], atol=1e-13)
+    fine = vp.simulate(scene, *start, duration=1.0, tolerance=1e-11, controls=u, integrator=vp.Gauss(3))
+    assert np.abs(motion.q[-1] - fine.q[-1]).max() < 1e-7
+
+
+def test_work_and_precision_under_constraints():
+    scene, q = five_bar()
+    v = along_constraints(scene, q, np.array([1.0, 0.0, 0.0, 2.0]))
+    record = vp.work_precision(scene, q, v, duration=0.4, dts=[0.01, 0.005], repeats=1)
+    assert {run.integrator for run in record.runs} == {
+        "Midpoint(alpha=0.5)", *(f"Gauss(stages={stages})" for stages in (2, 3, 4, 5))
+    }  # fmt: skip
+    assert record.reference == "Gauss(stages=4) in ever smaller steps"
+    assert record.reference_error < 1e-12
+    # A damped motion keeps no energy.
+    assert all(np.isnan(run.energy_error) for run in record.runs)
+    coarse, fine = (run for run in record.runs if run.order == 2)
+    assert np.log2(coarse.error / fine.error) == pytest.approx(2.0, abs=0.3)
+    with refused(vp.InputError, "RungeKutta4", "constraints"):
+        vp.work_precision(scene, q, v, duration=0.4, integrators=[vp.RungeKutta4()])
+
+
+def test_plans_by_different_integrators():
+    problem = reach()[0].at(dt=0.04, steps=10)
+    record = vp.optimal_control_tradeoff(problem, integrators=[vp.Midpoint(), vp.Gauss(2)], dts=[0.04], repeats=1)
+    rough, good = record.runs
+    assert not rough.failure
+    assert abs(good.closed_loop_cost / good.planned_cost - 1.0) < abs(rough.closed_loop_cost / rough.planned_cost - 1.0)

@@ -42,12 +42,10 @@ def inertia(case: zoo.Case, q: np.ndarray) -> np.ndarray:
 
 
 def step_state(case: zoo.Case, integrator: vp.Integrator, q: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """v from the second half of a state."""
     return np.linalg.solve(inertia(case, q), x) if integrator.variational else x
 
 
 def second(motion: vp.Trajectory, integrator: vp.Integrator) -> np.ndarray:
-    """The second half of the states of a motion."""
     return motion.p if integrator.variational else motion.v
 
 
@@ -77,7 +75,6 @@ def rows(case: zoo.Case, parts: int, momenta: bool) -> dict:
 
 @functools.cache
 def gains(case: zoo.Case, momenta: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Feedback that changes controls by some of their amplitude, and its reference."""
     n, m = case.q0.size, case.scene.controls
     start = inertia(case, case.q0) @ case.v0 if momenta else case.v0
     sizes = np.concatenate([np.full(n, 0.5), np.full(n, np.abs(start).max() + 1e-9)])
@@ -111,7 +108,6 @@ def law(case: zoo.Case, parts: int, momenta: bool) -> dict:
 
 
 def along(case: zoo.Case, before: np.ndarray, after: np.ndarray, k: int) -> Callable[[float], np.ndarray]:
-    """Controls that go from one value to another over interval k."""
     return lambda t: before + (t / case.span * PIECES - k) * (after - before)
 
 
@@ -127,8 +123,6 @@ def plain_policy_of_lines(case: zoo.Case, momenta: bool) -> Callable:
 
 
 def constant(values: Callable[[zoo.Case, bool, int, np.ndarray, np.ndarray], np.ndarray]) -> Callable:
-    """The oracle of controls that are held over intervals."""
-
     def plain(case: zoo.Case, momenta: bool) -> Callable:
         def over(k: int, q: np.ndarray, v: np.ndarray) -> Callable:
             u = values(case, momenta, k, q, v)
@@ -237,7 +231,6 @@ def combined(names: list[str], integrators: list, signals: list, each: int, firs
 
 
 def keeping(integrators: list) -> list:
-    """Those that keep constraints."""
     return [own for own in integrators if isinstance(own, vp.Midpoint | vp.Gauss) and getattr(own, "alpha", 0.5) == 0.5]
 
 
@@ -313,7 +306,6 @@ KINKS = {
 
 @pytest.mark.parametrize("name", KINKS)
 def test_kinks(name):
-    """A bounce off stops, a stop by friction and servos from their limit on, in fine steps against the oracle."""
     force, q0, v0, duration = KINKS[name]
     scene = vp.Scene(vp.planar_chain(2), damping=0.1, forces=force)
     goal = np.array([-0.4, 0.3]) if name == "reach" else np.zeros(2)
@@ -328,19 +320,9 @@ def test_kinks(name):
         np.testing.assert_allclose(motion.energy[::500], own.energy, rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", [name for name in zoo.ZOO if name not in MOVED])
-def test_the_oracle_balances(name):
-    """The oracle's own energy changes by the work of its forces without potential."""
-    case = zoo.ZOO[name]
-    own = oracle(case, BY_NAME["open loop"], False)
-    size = np.abs(own.energy).max() + np.abs(own.work).max()
-    np.testing.assert_allclose(own.energy - own.energy[0], own.work, rtol=0, atol=1e-9 * size)
-
-
 @pytest.mark.parametrize("signal", [SIGNALS[0], *SIGNALS[3:]], ids=lambda signal: signal.name)
 @pytest.mark.parametrize("name", [*SILENT[::5], "stops", "servos", "frame springs"])
 def test_reference(name, signal):
-    """The reference integrator meets its tolerance at any step."""
     case = zoo.ZOO[name]
     own, motion = oracle(case, signal, False), motion_of(case, vp.Reference(1e-11), signal, 1)
     np.testing.assert_allclose(motion.q, own.q, rtol=0, atol=2e-9)
@@ -359,18 +341,6 @@ def test_the_ledger_is_the_drift(name, driven):
         if len(set(case.scene.group)) == 1:
             np.testing.assert_allclose(motion.statistics.energy_defect, drift, rtol=1e-6, atol=1e-12 * size)
         assert (motion.statistics.energy_defect >= drift - 1e-12 * size).all()
-
-
-@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(1)], ids=str)
-def test_the_heat_of_dampers_is_counted(integrator):
-    """energy_defect of the midpoint rule counts h d v^2 at the middle of each step, and forgets what is damped."""
-    case = zoo.ZOO["dampers"]
-    motion = motion_of(case, integrator, SIGNALS[0], 5)
-    rate = np.diff(motion.q, axis=0) / motion.dt
-    heat = np.cumsum(motion.dt * (rate**2 @ np.array([0.8, 0.5, 0.7])))
-    assert heat[-1] > 0.05
-    drift = np.abs(motion.energy[1:] - motion.energy[0] + heat)
-    np.testing.assert_allclose(motion.statistics.energy_defect, drift, rtol=0.1, atol=1e-11)
 
 
 @pytest.mark.parametrize("integrator", VARIATIONAL, ids=str)
@@ -399,7 +369,6 @@ def symplectic(case: zoo.Case, motion: vp.Trajectory) -> None:
 @pytest.mark.parametrize("integrator", [own for own in VARIATIONAL if not isinstance(own, vp.Radau)], ids=str)
 @pytest.mark.parametrize("name", CONSERVATIVE)
 def test_reversal(name, integrator):
-    """A conservative motion of a symmetric method runs back to its start, and its steps are symplectic."""
     case = zoo.ZOO[name]
     there = motion_of(case, integrator, SIGNALS[0], 5)
     back = vp.simulate(
@@ -417,7 +386,6 @@ def test_reversal(name, integrator):
 
 @pytest.mark.parametrize("name", [*FREE, "four-bar"])
 def test_jet(name):
-    """The Lagrangian and its derivatives against differences of the oracle's energies."""
     case, rng = zoo.ZOO[name], np.random.default_rng(4)
     own, q, v, n = Mechanism(case.scene), case.q0, case.v0, case.q0.size
     dq = rng.uniform(-1.0, 1.0, n)
@@ -525,7 +493,6 @@ class Step:
 
 
 def derivative_cases(integrators: list, each: int, first: int) -> list:
-    """Scenes, integrators, and whether controls are lines."""
     found = []
     for own in (
         *combined(FREE, integrators, SIGNALS, each, first),
@@ -541,7 +508,6 @@ def derivative_cases(integrators: list, each: int, first: int) -> list:
 
 @pytest.mark.parametrize(("case", "integrator", "lines"), derivative_cases([*EVERY, vp.Reference()], 2, 1))
 def test_linearization(case, integrator, lines):
-    """A, B and ramp against differences of the step along random directions."""
     if isinstance(integrator, vp.Reference) and case.scene.processes:
         pytest.skip("the reference takes no noise")
     step, rng = Step(case, integrator, lines), np.random.default_rng(7)
@@ -560,7 +526,6 @@ def test_linearization(case, integrator, lines):
 
 @pytest.mark.parametrize(("case", "integrator", "lines"), derivative_cases(VARIATIONAL, 1, 0))
 def test_second_order(case, integrator, lines):
-    """xx, ux and uu against differences of z' [A B] along random directions."""
     if case.name == "custom force":
         with pytest.raises(vp.InputError, match="CustomForce"):
             vp.second_order(case.scene, Step(case, integrator, False).motion, np.ones(6))
@@ -586,7 +551,6 @@ def test_second_order(case, integrator, lines):
 
 
 def fields(case: zoo.Case, q: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """The diffusion fields (n, k), by the formulas of the noise models."""
     n, B = q.size, case.scene.actuation
     return {
         "trembling": lambda: np.diag([0.3, 0.2]),
@@ -722,7 +686,6 @@ def test_inputs_between_calls_of_a_law(name):
 
 
 def same(one: object, other: object) -> bool:
-    """Whether every field of two records is the same to the last bit."""
     if dataclasses.is_dataclass(one):
         return all(same(getattr(one, own.name), getattr(other, own.name)) for own in dataclasses.fields(one))
     if isinstance(one, np.ndarray):
@@ -734,7 +697,6 @@ def same(one: object, other: object) -> bool:
 
 @over_some
 def test_records(case, integrator, signal, tmp_path):
-    """A motion is the same to the last bit when run again, saved, pickled, and in a scene that was pickled."""
     motion = motion_of(case, integrator, signal, 2, check=True)
     assert same(motion, motion_of(case, integrator, signal, 2, check=True))
     back = vp.Trajectory.load(motion.save(tmp_path / "motion.npz"))
@@ -775,17 +737,25 @@ def test_halves(case, integrator, signal):
     assert same(vp.linearize(case.scene, whole.part(k, 2 * k)).A, A[k:])
 
 
-def test_a_ringing_custom_force():
-    """A CustomForce that is faster than the step leaves a motion, with a warning, as a damper of the scene does."""
-    force = vp.CustomForce(lambda q, v: -40.0 * v, "complex")
-    scene, integrator = vp.Scene(vp.planar_chain(1), damping=0.0, forces=force), vp.Midpoint()
-    motion = vp.simulate(scene, [0.3], [2.0], dt=0.1, steps=8, integrator=integrator)
-    assert motion.warnings[0].kind == "error"
+# Without inputs, which move along the lines or cubics of each step, whatever the path between its nodes.
+@pytest.mark.parametrize(("case", "integrator", "signal"), [one for one in MOTIONS if one.values[0].path is None])
+def test_error(case, integrator, signal):
+    """The error is the distance from the continuous motion; it is told from 1 % of the travel on, not below 0.7 %."""
+    own, motion = oracle(case, signal, integrator.variational), motion_of(case, integrator, signal, 5, check=True)
+    off, v_off = np.abs(motion.q[::5] - own.q), np.abs(motion.v[::5] - own.v).max(axis=0)
+    rel = 0.5 if case.scene.servo_joints else 0.1
+    assert motion.error[::5].max() == pytest.approx(off.max(), rel=rel, abs=1e-9)
+    assert np.abs(motion.error[::5] - off).max() < 2.0 * rel * off.max() + 1e-9
+    assert motion.error_bound is None or motion.error_bound > off.max() - 1e-9
+    assert not motion.error.flags.writeable
+    told = any(finding.kind == "error" for finding in motion.warnings)
+    share, fast = (off / np.ptp(motion.q, axis=0).max()).max(), (v_off / np.abs(own.v).max(axis=0)).max() > 0.2
+    assert told or not share > 0.0105
+    assert not told or share > 0.007 or fast
 
 
 @pytest.mark.parametrize("name", list(zoo.ZOO))
 def test_right_motions_have_no_warnings_of_errors(name):
-    """A motion within 1e-4 of the continuous one, by the usual integrator, is not called wrong."""
     case = zoo.ZOO[name]
     signal = PATHS[0] if case.path is not None else SIGNALS[0]
     motion = motion_of(case, vp.Gauss(2), signal, 10, check=True)

@@ -27,12 +27,19 @@ def _compiler():
         pytest.skip("there is no C++ compiler")
 
 
+@pytest.fixture
+def arm(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "examples" / "cpp"))
+    return importlib.import_module("arm")
+
+
 @pytest.fixture(params=sorted((ROOT / "tests" / "cpp").glob("*.cpp")), ids=lambda path: path.stem)
-def program(request, tmp_path):
+def program(request, tmp_path, arm):
+    (tmp_path / "arm.hpp").write_text(arm.header(vp.Scene(vp.planar_chain(3))))
     target = tmp_path / "program"
     # That of undefined behaviour doubles the time of the compiler; .ci/sanitize has it, on the same headers.
     checks = ["-fsanitize=address", "-D_GLIBCXX_ASSERTIONS"]
-    subprocess.run([COMPILER, *FLAGS, *checks, request.param, "-o", target], check=True)
+    subprocess.run([COMPILER, *FLAGS, *checks, f"-I{tmp_path}", request.param, "-o", target], check=True)
     return target
 
 
@@ -76,7 +83,6 @@ def configured(tmp_path):
 
 
 def includes(build):
-    """The folder of headers that the example's compiler is given."""
     flags = (build / "CMakeFiles" / "plan.dir" / "flags.make").read_text()
     (found,) = re.findall(r"-(?:I|isystem )(\S*/include)\b", flags)
     return Path(found)
@@ -161,17 +167,15 @@ def planned():
 
 
 @pytest.mark.parametrize("surroundings", [{}, {"damping": 0.1, "forces": vp.JointStop(100.0)}], ids=["alone", "forces"])
-def test_a_scene_with_any_number_of_forces_is_written(surroundings, monkeypatch, tmp_path):
-    monkeypatch.syspath_prepend(str(ROOT / "examples" / "cpp"))
-    text = importlib.import_module("arm").header(vp.Scene(vp.load_robot("ur5"), **surroundings))
+def test_a_scene_with_any_number_of_forces_is_written(surroundings, arm, tmp_path):
+    text = arm.header(vp.Scene(vp.load_robot("ur5"), **surroundings))
     source = tmp_path / "arm.cpp"
     source.write_text(f"{text.replace('#pragma once', '')}\nint main() {{ return arm().dof() == 6 ? 0 : 1; }}\n")
     subprocess.run([COMPILER, *FLAGS, source, "-o", tmp_path / "program"], check=True)
     subprocess.run([tmp_path / "program"], check=True)
 
 
-def test_what_the_example_does_not_write_is_refused(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "examples" / "cpp"))
+def test_what_the_example_does_not_write_is_refused(arm):
     scene = vp.Scene(vp.load_robot("ur5"), forces=vp.FrameWrench("tool0", [0.0, 0.0, -1.0, 0.0, 0.0, 0.0]))
     with refused(SystemExit, "forces", "frames"):
-        importlib.import_module("arm").header(scene)
+        arm.header(scene)

@@ -29,93 +29,62 @@ def slopes(q, v):
     return by_q, by_v
 
 
-def scene(**options):
-    return vp.Scene(ROBOT, forces=vp.CustomForce(drag, slopes), **options)
-
-
 def simulate(own, **options):
     given = {"dt": 0.01, "steps": 5, "controls": [1.0, 0.5, -0.2], "check": False}
     return vp.simulate(own, Q0, V0, **(given | options))
 
 
-class TestDerivatives:
-    @pytest.mark.parametrize("derivatives", ["complex", None])
-    def test_all_ways_agree(self, derivatives):
-        given, other = (vp.CustomForce(drag, how) for how in (slopes, derivatives))
-        for q, v in itertools.product(np.random.default_rng(0).normal(size=(3, 3)), repeat=2):
-            for one, two in zip(given.slopes(q, v), other.slopes(q, v), strict=True):
-                np.testing.assert_allclose(one, two, rtol=0, atol=1e-14 if derivatives else 1e-10)
+@pytest.mark.parametrize("derivatives", ["complex", None])
+def test_all_derivatives_agree(derivatives):
+    given, other = (vp.CustomForce(drag, how) for how in (slopes, derivatives))
+    for q, v in itertools.product(np.random.default_rng(0).normal(size=(3, 3)), repeat=2):
+        for one, two in zip(given.slopes(q, v), other.slopes(q, v), strict=True):
+            np.testing.assert_allclose(one, two, rtol=0, atol=1e-14 if derivatives else 1e-10)
 
 
-class TestLedger:
-    def test_holding(self):
-        own = vp.Scene(ROBOT, forces=vp.CustomForce(lambda q, v: np.array([1.0, -2.0, 0.5]) + v))
-        np.testing.assert_allclose(
-            own.holding_torque(Q0), vp.Scene(ROBOT).holding_torque(Q0) - [1.0, -2.0, 0.5], atol=1e-12
-        )
-        held = vp.simulate(own, Q0, np.zeros(3), dt=0.01, steps=3, controls=own.holding_controls(Q0), check=False)
-        np.testing.assert_allclose(held.q, np.tile(Q0, (4, 1)), atol=1e-12)
+def test_holding():
+    own = vp.Scene(ROBOT, forces=vp.CustomForce(lambda q, v: np.array([1.0, -2.0, 0.5]) + v))
+    torque = vp.Scene(ROBOT).holding_torque(Q0) - [1.0, -2.0, 0.5]
+    np.testing.assert_allclose(own.holding_torque(Q0), torque, atol=1e-12)
+    held = vp.simulate(own, Q0, np.zeros(3), dt=0.01, steps=3, controls=own.holding_controls(Q0), check=False)
+    np.testing.assert_allclose(held.q, np.tile(Q0, (4, 1)), atol=1e-12)
 
 
-class TestRefused:
-    @pytest.mark.parametrize(
-        ("f", "facts"),
-        [
-            (lambda q, v: np.zeros(2), "(3,)"),
-            (lambda q, v: 1j * v, "real numbers"),
-            (lambda q, v: v / 0.0 if q[0] > 0.31 else v, ("finite", "q = ")),
-            (lambda q, v: 1 / 0, "ZeroDivisionError"),
-        ],
-    )
-    def test_what_is_no_force(self, f, facts):
-        own = vp.Scene(ROBOT, forces=vp.CustomForce(f))
-        with refused(vp.ForceError, "CustomForce <lambda>", facts) as info, np.errstate(all="ignore"):
-            simulate(own)
-        assert info.value.trajectory.steps == info.value.step
+@pytest.mark.parametrize(
+    ("force", "facts"),
+    [
+        (vp.CustomForce(lambda q, v: np.zeros(2)), ("CustomForce <lambda>", "(3,)")),
+        (vp.CustomForce(lambda q, v: 1j * v), ("CustomForce <lambda>", "real numbers")),
+        (vp.CustomForce(lambda q, v: v / 0.0 if q[0] > 0.31 else v), ("CustomForce <lambda>", "finite", "q = ")),
+        (vp.CustomForce(lambda q, v: 1 / 0), ("CustomForce <lambda>", "ZeroDivisionError")),
+        (vp.CustomForce(drag, lambda q, v: np.eye(3)), "derivatives"),
+        (vp.CustomForce(drag, lambda q, v: (np.eye(3), np.eye(2))), "derivatives"),
+    ],
+)
+def test_what_is_no_force(force, facts):
+    with refused(vp.ForceError, facts) as info, np.errstate(all="ignore"):
+        simulate(vp.Scene(ROBOT, forces=force))
+    assert info.value.trajectory.steps == info.value.step
 
-    def test_wrong_derivatives(self):
-        for wrong in (lambda q, v: np.eye(3), lambda q, v: (np.eye(3), np.eye(2))):
-            with refused(vp.ForceError, "derivatives"):
-                simulate(vp.Scene(ROBOT, forces=vp.CustomForce(drag, wrong)))
 
-    def test_wrong_arguments(self):
-        with refused(vp.InputError, "function"):
-            vp.CustomForce(np.zeros(3))
-        with refused(vp.InputError, "'exact'"):
-            vp.CustomForce(drag, "exact")
+def test_wrong_arguments():
+    with refused(vp.InputError, "function"):
+        vp.CustomForce(np.zeros(3))
+    with refused(vp.InputError, "'exact'"):
+        vp.CustomForce(drag, "exact")
 
 
 def test_shown():
     assert repr(vp.CustomForce(drag, "complex")) == "CustomForce(drag, derivatives by complex steps)"
 
 
-def test_a_function_that_raises_in_the_check_leaves_the_motion():
-    def drag(q, v):
-        if abs(v[1]) > 4.6:
-            raise ValueError("beyond the table")
-        return -0.1 * v
-
-    force = vp.CustomForce(drag, lambda q, v: (np.zeros((2, 2)), -0.1 * np.eye(2)))
-    scene = vp.Scene(vp.planar_chain(2), forces=[force])
-    motion = vp.simulate(scene, [0.3, 0.3], [0.0, 0.0], dt=0.05, steps=30, integrator=vp.Midpoint())
-    assert motion.steps == 30
-    assert not unnamed(motion.warnings[0], "not known", "beyond the table")
-    assert np.isnan(motion.error).all()
-
-
-def narrow(q, v):
+def test_differences_take_steps_smaller_than_what_they_look_at():
     """Friction that turns round within a ten-thousandth [rad/s]."""
-    return -0.5 * np.tanh(v / 1e-4)
-
-
-class TestDifferences:
-    def test_narrow_friction(self):
-        """Steps of differences become smaller than what they look at."""
-        own = vp.CustomForce(narrow)
-        for v in (0.0, 2e-5, 1e-4, 3e-4, 0.01):
-            _, by_v = own.slopes(np.zeros(3), np.full(3, v))
-            exact = -0.5 / 1e-4 / np.cosh(v / 1e-4) ** 2
-            np.testing.assert_allclose(by_v, exact * np.eye(3), rtol=0, atol=1e-6 * max(1.0, abs(exact)))
+    own = vp.CustomForce(lambda q, v: -0.5 * np.tanh(v / 1e-4))
+    for v in (0.0, 2e-5, 1e-4, 3e-4, 0.01):
+        _, by_v = own.slopes(np.zeros(3), np.full(3, v))
+        exact = -0.5 / 1e-4 / np.cosh(v / 1e-4) ** 2
+        np.testing.assert_allclose(by_v, exact * np.eye(3), rtol=0, atol=1e-6 * max(1.0, abs(exact)))
 
 
 class TestDerivativesThatAreWrong:
@@ -201,7 +170,6 @@ class TestWhereItFails:
         assert plan.cost < still.cost_of(still.simulate(np.zeros((10, 3))))
 
     def test_newton_names_it(self):
-        """A force that jumps leaves no solution of a step."""
         jumps = vp.CustomForce(lambda q, v: -200.0 * np.sign(v - 0.013))
         own = vp.Scene(ROBOT, gravity=False, forces=jumps)
         with refused(vp.StepFailure, "CustomForce <lambda>"):

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from findings import about
 
 import varpin as vp
 
@@ -15,66 +14,29 @@ DT, STEPS = 0.01, 100
 ENDS = {"lower": {"joint1": -9.0, "joint2": -9.0}, "upper": {"joint1": 9.0, "joint2": 0.5}}
 
 
-def jumps(*size):
-    return np.random.default_rng(0).uniform(-1.0, 1.0, (STEPS, 2)) * size
-
-
-def off(scene, q0, v0, controls, motion):
-    """By how much q and v are off at the nodes, of the largest joint travel and of the largest velocity."""
-    fine = {"dt": DT / 32, "steps": 32 * STEPS, "controls": np.repeat(controls, 32, axis=0)}
-    true = vp.simulate(scene, q0, v0, **fine, integrator=vp.Radau(3), check=False)
-    q, v = true.q[::32], true.v[::32]
-    return np.abs(motion.q - q).max() / np.ptp(q, axis=0).max(), np.abs(motion.v - v).max() / np.abs(v).max()
-
-
-def dragged():
-    """A damper on the tip that has no lever at the start, and one that grows: Gauss(2) loses 8 % of a velocity."""
-    forces = [vp.FrameDamper("tip", [0.0, 0.0, 0.0], [0.0, 0.0, 1e4])]
-    return vp.Scene(CHAIN, gravity=False, forces=forces), [1.57, 0.0], [2.0, -3.0], jumps(20.0, 20.0)
-
-
 def stopped():
     """A joint that is pressed into a damped stop; Gauss(2) loses 2 % of a velocity."""
     stop = vp.JointStop(1e3, 300.0, **ENDS, width=0.05)
-    return (
-        vp.Scene(CHAIN, gravity=False, damping=0.3, forces=[stop]),
-        [0.0, 0.0],
-        [0.5, 0.0],
-        jumps(6.0, 6.0) + np.array([0.0, 5.0]),
-    )
+    scene = vp.Scene(CHAIN, gravity=False, damping=0.3, forces=[stop])
+    controls = np.random.default_rng(0).uniform(-6.0, 6.0, (STEPS, 2)) + np.array([0.0, 5.0])
+    return scene, [0.0, 0.0], [0.5, 0.0], controls
 
 
 def test_stops_ahead():
-    """The choice at the start is ready for a stop that comes later."""
     scene, q0, v0, controls = stopped()
     options = {"dt": DT, "steps": STEPS, "controls": controls}
     usual = vp.simulate(scene, q0, v0, **options)
-    assert usual.integrator == "Radau(stages=4)"
-    assert usual.warnings == ()
-    in_q, in_v = off(scene, q0, v0, controls, usual)
-    assert in_q < 1e-3
-    assert in_v < 3e-3
-    # A given integrator is taken.
     named = vp.simulate(scene, q0, v0, **options, integrator=vp.Gauss(2), check=False)
-    assert named.integrator == "Gauss(stages=2)"
-    assert off(scene, q0, v0, controls, named)[1] > 0.02
-
-
-def test_damping_that_gets_fast_along_the_way():
-    """The start does not show it: the error names the method that is right."""
-    scene, q0, v0, controls = dragged()
-    options = {"dt": DT, "steps": STEPS, "controls": controls}
-    usual = vp.simulate(scene, q0, v0, **options)
-    assert usual.integrator == "Gauss(stages=2)"
-    (told,) = about(usual.warnings, "error")
-    assert "varpin.Radau(4)" in told
-    better = vp.simulate(scene, q0, v0, **options, integrator=vp.Radau(4))
-    assert better.warnings == ()
-    assert off(scene, q0, v0, controls, better)[1] < 3e-3 < off(scene, q0, v0, controls, usual)[1]
+    assert (usual.integrator, named.integrator) == ("Radau(stages=4)", "Gauss(stages=2)")
+    assert usual.warnings == ()
+    fine = {"dt": DT / 32, "steps": 32 * STEPS, "controls": np.repeat(controls, 32, axis=0)}
+    true = vp.simulate(scene, q0, v0, **fine, integrator=vp.Radau(3), check=False)
+    q, v = true.q[::32], true.v[::32]
+    assert np.abs(usual.q - q).max() < 1e-3 * np.ptp(q, axis=0).max()
+    assert np.abs(usual.v - v).max() < 3e-3 * np.abs(v).max() < 0.15 * np.abs(named.v - v).max()
 
 
 def test_a_stop_between_two_nodes():
-    """A joint that bounces off a stiff stop and back within a step."""
     stop = vp.JointStop(1e6, 500.0, **ENDS, width=1e-3)
     scene = vp.Scene(CHAIN, gravity=False, forces=[stop])
     # The nodes lie 0.005 rad before the stop and behind it.
@@ -91,7 +53,6 @@ def test_a_stiff_stop():
 
 
 def test_paths_without_noise_are_those_of_simulate():
-    """Of one start, and of many of which some ask for more."""
     scene, q0, v0, controls = stopped()
     options = {"dt": DT, "steps": STEPS, "controls": controls}
     alone = vp.simulate(scene, q0, v0, **options)

@@ -1,105 +1,48 @@
-"""Forces on joints: each against its formula, their short forms, and what scenes say of them."""
+"""Forces on joints and between frames: joint forces by their formulas, short forms, what scenes say of them."""
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from findings import about
-from naive import gradient
-from oracles import slope
+from oracles import Mechanism, slope
 from refusals import naming, refused, unnamed
+from test_groups import forest
 
 import varpin as vp
-from varpin.core.arrays import Element
+
+CASES = {
+    "spring": vp.JointSpring(3.0, 0.4),
+    "damper": vp.JointDamper(0.7),
+    "friction": vp.CoulombFriction(0.5, 0.1),
+    "breakaway": vp.CoulombFriction(0.5, 0.1, 0.9, 0.3),
+    "stops": vp.JointStop(50.0, 3.0, -1.0, 1.0, 0.2),
+    "one stop": vp.JointStop(50.0, 0.0, -np.inf, 0.5, 0.2),
+    "servo": vp.PositionServo(2.0, 0.3, 2.0),
+}
 
 
-def rise(y):
-    """How much of a stop acts: a smooth step from 0 to 1."""
-    y = np.where(np.real(y) < 0.0, 0.0, np.where(np.real(y) > 1.0, 1.0, y))
-    return 3.0 * y**2 - 2.0 * y**3
-
-
-def depths(lower, upper, q):
-    return [*([q - upper] if np.isfinite(upper) else []), *([lower - q] if np.isfinite(lower) else [])]
-
-
-def stop_energy(depth, stiffness, width):
-    """The energy of a stop of unit width, from the integrals of its rise."""
-    y = depth / width
-    within = y**4 / 4.0 - y**5 / 10.0
-    beyond = 0.15 + 0.5 * (y - 1.0) + 0.5 * (y - 1.0) ** 2
-    return stiffness * width**2 * np.where(np.real(y) <= 0.0, 0.0, np.where(np.real(y) < 1.0, within, beyond))
-
-
-def energy(element, q):
-    """The potential energy of one element at complex q of its joint."""
-    values = element.values
-    if element.kind == "JointSpring":
-        return 0.5 * values[0] * (q - values[1]) ** 2
-    if element.kind == "JointStop":
-        lower, upper, stiffness, _, width = values
-        return sum(stop_energy(depth, stiffness, width) for depth in depths(lower, upper, q))
-    return 0.0 * q
-
-
-def force(element, q, v, f=0.0):
-    """The force of one element besides that of its energy, at complex q and v of its joint."""
-    values = element.values
-    if element.kind == "JointDamper":
-        return -values[0] * v
-    if element.kind == "CoulombFriction":
-        level, width, breakaway, fading = values
-        return -(level + (breakaway - level) * np.exp(-((v / fading) ** 2))) * np.tanh(v / width)
-    if element.kind == "JointStop":
-        lower, upper, _, damping, width = values
-        return -damping * sum(rise(depth / width) for depth in depths(lower, upper, q)) * v
-    if element.kind == "PositionServo":
-        stiffness, damping, effort = values
-        wanted = f - stiffness * q - damping * v
-        side, y = np.sign(np.real(wanted)), wanted * np.sign(np.real(wanted)) / effort
-        bent = np.where(np.real(y) < 1.1, y - 2.5 * (y - 0.9) ** 2, 1.0)
-        return np.where(np.real(y) < 0.9, wanted, side * effort * bent) - f
-    return 0.0 * q
-
-
-CASES = [
-    (vp.JointSpring(3.0, 0.4), Element("JointSpring", 0, (3.0, 0.4))),
-    (vp.JointDamper(0.7), Element("JointDamper", 0, (0.7,))),
-    (vp.CoulombFriction(0.5, 0.1), Element("CoulombFriction", 0, (0.5, 0.1, 0.5, 1.0))),
-    (vp.CoulombFriction(0.5, 0.1, 0.9, 0.3), Element("CoulombFriction", 0, (0.5, 0.1, 0.9, 0.3))),
-    (vp.JointStop(50.0, 3.0, -1.0, 1.0, 0.2), Element("JointStop", 0, (-1.0, 1.0, 50.0, 3.0, 0.2))),
-    (vp.JointStop(50.0, 0.0, -np.inf, 0.5, 0.2), Element("JointStop", 0, (-np.inf, 0.5, 50.0, 0.0, 0.2))),
-    (vp.PositionServo(2.0, 0.3, 2.0), Element("PositionServo", 0, (2.0, 0.3, 2.0))),
-]
-
-
-@pytest.mark.parametrize(("given", "element"), CASES, ids=lambda own: repr(own)[:40])
-def test_each_against_its_formula(given, element):
-    """Energy, forces and their derivatives at places before, in and beyond the rise of a stop, by the complex step."""
-    robot = vp.planar_chain(1)
-    scene, bare = vp.Scene(robot, forces=given), vp.Scene(robot)
-    assert scene.elements == (element,)
+@pytest.mark.parametrize("name", CASES)
+def test_each_against_its_formula(name):
+    robot, one = vp.planar_chain(1), np.ones(1)
+    scene, bare = vp.Scene(robot, forces=CASES[name]), vp.Scene(robot)
+    plain, drive = Mechanism(scene).forces, np.array([0.7])
     for q, v in [(-1.35, 0.4), (-1.05, -0.2), (0.1, 0.03), (0.6, -0.3), (1.15, 0.9), (1.6, -0.05), (3.0, 0.0)]:
         at, rate = np.array([q]), np.array([v])
         own, other = vp.lagrangian_jet(scene, at, rate), vp.lagrangian_jet(bare, at, rate)
-
-        def potential(x):
-            return energy(element, x[..., 0])
-
-        pull = gradient(potential, at)
-        assert pytest.approx(energy(element, q), rel=1e-12, abs=1e-13) == other.L - own.L
-        assert own.Lq - other.Lq == pytest.approx(-pull, rel=1e-12, abs=1e-13)
-        curvature = slope(lambda x: gradient(potential, x), at, np.ones(1), 1e-4)
-        assert own.Lqq[0] - other.Lqq[0] == pytest.approx(-curvature, rel=1e-9, abs=1e-9)
-        value, by_q, by_v, lost = (array[0] for array in scene.core.forces(at[None], rate[None], np.array([[0.7]])))
-        assert value == pytest.approx([force(element, q, v, 0.7)], rel=1e-13, abs=1e-15)
-        assert by_q == pytest.approx(
-            gradient(lambda x, v=v: force(element, x[..., 0], v, 0.7), at), rel=1e-12, abs=1e-14
-        )
-        assert by_v == pytest.approx(
-            gradient(lambda x, q=q: force(element, q, x[..., 0], 0.7), rate), rel=1e-12, abs=1e-14
-        )
-        if element.kind != "PositionServo":
-            assert lost == pytest.approx([-force(element, q, v) * v], rel=1e-13, abs=1e-15)
+        V, pull, rest = plain(at, rate, drive)
+        assert pytest.approx(V, rel=1e-12, abs=1e-13) == other.L - own.L
+        assert own.Lq - other.Lq == pytest.approx(pull, rel=1e-12, abs=1e-13)
+        bend = slope(lambda x, rate=rate: plain(x, rate, drive)[1], at, one, 1e-4)
+        assert own.Lqq[0] - other.Lqq[0] == pytest.approx(bend, rel=1e-9, abs=1e-9)
+        value, by_q, by_v, lost = (array[0] for array in scene.core.forces(at[None], rate[None], drive[None]))
+        assert value == pytest.approx(rest - drive, rel=1e-13, abs=1e-15)
+        found = slope(lambda x, rate=rate: plain(x, rate, drive)[2], at, one, 1e-3)
+        assert by_q == pytest.approx(found, rel=1e-9, abs=1e-11)
+        found = slope(lambda x, at=at: plain(at, x, drive)[2], rate, one, 1e-3)
+        assert by_v == pytest.approx(found, rel=1e-9, abs=1e-11)
         assert lost[0] >= 0.0
+        if name != "servo":
+            assert lost == pytest.approx((drive - rest) * rate, rel=1e-13, abs=1e-15)
 
 
 def test_servos_far_faster_than_the_step_go_where_they_are_told():
@@ -161,31 +104,50 @@ def test_stops_are_where_the_description_has_limits():
 
 def test_scenes_show_their_forces():
     forces = [vp.CoulombFriction({"elbow_joint": 0.5}), vp.JointStop(1e3, np.full(6, 2.0)), vp.Armature(0.1)]
+    forces += [vp.FrameSpring("tool0", ("forearm_link", [0.05, 0.1, 0.0]), 8.0)]
     scene = vp.Scene(vp.load_robot("ur5"), forces=forces, noise=vp.AdditiveNoise(0.1))
-    assert "CoulombFriction, JointStop, Armature, noise of 6 processes" in repr(scene)
+    assert "CoulombFriction, JointStop, Armature, FrameSpring, noise of 6 processes" in repr(scene)
+    assert "FrameSpring(a='tool0', b=('forearm_link', [0.05, 0.1, 0.0]), stiffness=8.0, rest=0.0)" in repr(scene.forces)
     assert "CoulombFriction(level={'elbow_joint': 0.5}, width=0.01)" in repr(scene.forces)
     assert "CoulombFriction" in scene._repr_html_()
 
 
 @pytest.mark.parametrize(
-    ("force", "facts"),
+    ("make", "facts"),
     [
-        (vp.JointDamper(-1.0), ("damping[0]", "-1.0", "0")),
-        (vp.JointDamper(None), ("damping", "None")),
-        (vp.Armature([1.0, 2.0]), ("inertia", "(6,)")),
-        (vp.CoulombFriction(1.0, width=0.0), ("width[0]", "0.0", "0")),
-        (vp.CoulombFriction(1.0, breakaway=2.0), ("breakaway", "stribeck_velocity")),
-        (vp.CoulombFriction(1.0, 0.1, 0.5, 1.0), ("breakaway[0]", "0.5")),
-        (vp.JointStop(1.0, lower=1.0, upper=-1.0), ("lower[0]", "1.0", "upper")),
-        (vp.JointStop(1.0, lower=np.inf), ("lower[0]", "inf")),
-        ("friction", "forces"),
-        ([vp.JointDamper(1.0), 3.0], ("forces", "3.0")),
+        (lambda: vp.JointDamper(-1.0), ("damping[0]", "-1.0", "0")),
+        (lambda: vp.JointDamper(None), ("damping", "None")),
+        (lambda: vp.Armature([1.0, 2.0]), ("inertia", "(6,)")),
+        (lambda: vp.CoulombFriction(1.0, width=0.0), ("width[0]", "0.0", "0")),
+        (lambda: vp.CoulombFriction(1.0, breakaway=2.0), ("breakaway", "stribeck_velocity")),
+        (lambda: vp.CoulombFriction(1.0, 0.1, 0.5, 1.0), ("breakaway[0]", "0.5")),
+        (lambda: vp.JointStop(1.0, lower=1.0, upper=-1.0), ("lower[0]", "1.0", "upper")),
+        (lambda: vp.JointStop(1.0, lower=np.inf), ("lower[0]", "inf")),
+        (lambda: "friction", "forces"),
+        (lambda: [vp.JointDamper(1.0), 3.0], ("forces", "3.0")),
+        (lambda: vp.FrameWrench("base_link", np.ones(6)), "'base_link'"),
+        (lambda: vp.FrameWrench("tool0", np.ones(3)), ("wrench", "(6,)")),
+        (lambda: vp.FrameWrench([0.5, 0.0, 0.4], np.ones(6)), ("frame", "[0.5, 0.0, 0.4]")),
+        (lambda: vp.FrameWrench("tool0", np.ones(6), "local"), ("axes", "'world'", "'frame'", "'local'")),
+        (lambda: vp.FrameSpring("tool0", [0, 0], 1.0), ("b", "(2,)")),
+        (lambda: vp.FrameSpring([0, 0, 0], "base_link", 1.0), ("FrameSpring", "'ur5'")),
+        (lambda: vp.FrameSpring("tool0", [0, 0, 0], -1.0), ("stiffness", "-1.0")),
+        (lambda: vp.FrameSpring("tool0", [0, 0, 0], 1.0, -0.1), ("rest", "-0.1")),
+        (lambda: vp.FrameSpring("tool0", [0, 0, 0], [1, 1, 1], 0.1), "stiffness"),
+        (lambda: vp.FrameSpring("tool0", [0, 0, 0], 1.0, rest_rotation=np.eye(3)), "rest_rotation"),
+        (
+            lambda: vp.FrameSpring("tool0", [0, 0, 0], 1.0, 0.0, 1.0, np.diag([1.0, 1.0, -1.0])),
+            "rest_rotation",
+        ),
+        (lambda: vp.FrameSpring("base_link", [0, 0, 0], 0.0, 0.0, 1.0), ("FrameSpring", "'ur5'")),
+        (lambda: vp.FrameDamper("tool0", [0, 0, 0], 1.0, np.nan), ("rotational_damping", "nan")),
+        (lambda: vp.FrameDamper(("tool0", [0, 0]), [0, 0, 0], 1.0), "(3,)"),
+        (lambda: vp.FrameDamper("tool0", [0, 0, 0], [1, np.inf, 1]), ("damping", "[1.0, inf, 1.0]")),
     ],
-    ids=lambda own: repr(own)[:40],
 )
-def test_what_is_no_force_is_refused(force, facts):
+def test_what_is_no_force_is_refused(make, facts):
     with refused(vp.InputError, facts):
-        vp.Scene(vp.load_robot("ur5"), forces=force)
+        vp.Scene(vp.load_robot("ur5"), forces=make())
 
 
 def test_stops_ends_and_servos_are_said():
@@ -220,6 +182,43 @@ def test_limits_are_held_against_what_drives_and_stops_do():
     stiff = vp.Scene(robot, gravity=False, forces=[vp.JointStop(1e5, 1e3)])
     for side in (1.0, -1.0):
         assert not about(said(stiff, [0, 0, 3.0 * side, 0, 0, 0], [0, 0, side, 0, 0, 0], 400), "position limits")
+
+
+def test_groups_that_couplings_join():
+    robot, tip, other = forest(0, 2), "0.2", "2.3"
+    spring = vp.FrameSpring(tip, other, 5.0)
+    assert vp.Scene(robot).group.tolist() == [0, 0, 0, 1, 1, 1, 1]
+    assert vp.Scene(robot, forces=vp.FrameSpring(tip, [0.0, 0.0, 0.0], 5.0)).group.max() == 1
+    assert vp.Scene(robot, forces=spring).group.tolist() == [0] * 7
+    q, v = np.random.default_rng(3).normal(size=(2, 7))
+    scene = vp.Scene(robot, forces=spring)
+    A = vp.linearize(scene, vp.simulate(scene, q, v, dt=1e-3, steps=1)).A[0]
+    assert np.abs(A[7:10, 3:7]).min() > 0.0
+    # Errors of the energy that passes between arms are no errors.
+    motion = vp.simulate(scene, q, np.zeros(7), dt=1e-3, steps=300, integrator=vp.RungeKutta4())
+    assert not about(motion.warnings, "error")
+
+
+def carrier():
+    """A heavy wheel that carries a light pendulum of two links."""
+    model = pin.Model()
+    parent = 0
+    for k, mass in enumerate((500.0, 0.01, 0.01)):
+        parent = model.addJoint(parent, pin.JointModelRY(), pin.SE3(np.eye(3), np.array([0.3 * k, 0, 0])), f"j{k}")
+        model.appendBodyToJoint(parent, pin.Inertia.FromSphere(mass, 0.2), pin.SE3(np.eye(3), np.array([0.2, 0, 0])))
+        placement = pin.SE3(np.eye(3), np.array([0.3, 0, 0]))
+        model.addFrame(pin.Frame(f"tip{k}", parent, 0, placement, pin.FrameType.OP_FRAME))
+    return vp.load_robot(model)
+
+
+@pytest.mark.parametrize("ends", [("tip2", "tip0"), ("tip2", [0.5, 0.0, -0.8]), ("tip2", "tip1")])
+def test_light_parts_balance_with_springs(ends):
+    robot = carrier()
+    assert robot.tree.loads.size
+    scene = vp.Scene(robot, forces=[vp.FrameSpring(*ends, 2.0), vp.FrameDamper(*ends, 0.002)])
+    q, v = np.array([0.1, 0.8, -0.5]), np.array([0.4, 0.0, 1.0])
+    motion = vp.simulate(scene, q, v, dt=2e-3, steps=500, integrator=vp.Gauss(2), check=False)
+    assert motion.statistics.split_steps == 0
 
 
 REST = [0.0, -1.0, 1.0, -0.5, 0.8, 0.0]

@@ -1,12 +1,11 @@
-"""Dry friction: joints that stick and slip, arms that come to rest, and steps that friction is too fast for."""
+"""Dry friction: arms that come to rest, and steps that friction is too fast for."""
 
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from findings import about
-from scipy.integrate import solve_ivp
+from oracles import exact
 
 import varpin as vp
 from varpin.simulation.spectrum import rate_at_rest
@@ -17,46 +16,8 @@ def block(width, level=1.0):
     return vp.Scene(vp.planar_chain(1), gravity=False, forces=vp.CoulombFriction(level, width))
 
 
-def accelerations(scene, q, v, u):
-    """By Pinocchio, and friction by its plain formula."""
-    force = u.copy()
-    for element in scene.elements:
-        c, (level, width, *_) = element.coordinate, element.values
-        force[c] -= level * np.tanh(v[c] / width)
-    model = scene.robot.model.copy()
-    model.gravity.linear = scene.gravity
-    return pin.aba(model, model.createData(), q, v, force)
-
-
 def own(motion):
     return about(motion.warnings, "error")
-
-
-def test_stick_slip_of_one_joint():
-    """A servo's goal moves on evenly, and the joint follows in jerks, as SciPy's Radau has it of the plain equation."""
-    stiffness, damping, speed = 4.0, 0.1, 0.5
-    level, width, breakaway, fading = 0.5, 1e-3, 1.5, 0.2
-    scene = vp.Scene(
-        vp.planar_chain(1),
-        gravity=False,
-        forces=[vp.PositionServo(stiffness, damping), vp.CoulombFriction(level, width, breakaway, fading)],
-    )
-    inertia = vp.lagrangian_jet(scene, [0.0], [0.0]).Lvv[0, 0]
-
-    def slope(t, x):
-        g = level + (breakaway - level) * np.exp(-((x[1] / fading) ** 2))
-        return [x[1], (stiffness * (speed * t - x[0]) - damping * x[1] - g * np.tanh(x[1] / width)) / inertia]
-
-    times = np.linspace(0.0, 4.0, 81)
-    exact = solve_ivp(slope, (0.0, 4.0), [0.0, 0.0], "Radau", t_eval=times, rtol=1e-9, atol=1e-12, max_step=0.01).y.T
-    at_rest = np.abs(exact[:, 1]) < width
-    assert 20 < at_rest.sum() < 75
-    assert exact[:, 1].max() > 2.0 * speed
-    goal = vp.FirstOrderHold((speed * np.linspace(0.0, 4.0, 4001))[:, None])
-    motion = vp.simulate(scene, [0.0], [0.0], dt=1e-3, steps=4000, controls=goal, integrator=vp.Radau(3))
-    np.testing.assert_allclose(motion.q[::50, 0], exact[:, 0], atol=2e-5)
-    np.testing.assert_allclose(motion.v[::50, 0][at_rest], exact[:, 1][at_rest], atol=1e-2 * width)
-    assert own(motion) == []
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.Gauss(4), vp.Radau(2), vp.Radau(3)], ids=str)
@@ -83,7 +44,6 @@ def test_friction_so_fast_that_steps_take_very_short_parts():
 
 
 def test_joints_that_do_not_stop_are_quiet():
-    """Friction far faster than the step where nothing comes to rest, and where nothing begins to move."""
     sliding = vp.simulate(block(1e-5, 0.1), [0.0], [2.0], dt=1e-2, steps=100)
     resting = vp.simulate(block(1e-5), [0.0], [0.0], dt=1e-2, steps=100)
     assert own(sliding) == own(resting) == []
@@ -118,15 +78,11 @@ def test_verification_under_friction_that_is_too_fast_for_explicit_steps():
     assert found.integrator == str(vp.Radau(3))
     assert found.told
     assert "Radau" in str(found)
-    scene, state, integral = rough.scene, np.zeros(4), 0.0
-    for u in plan.controls:
-
-        def slope(_, x, u=u):
-            return np.concatenate([x[2:], accelerations(scene, x[:2], x[2:], u)])
-
-        state = solve_ivp(slope, (0.0, rough.dt), state, "Radau", rtol=1e-8, atol=1e-11).y[:, -1]
-        integral += rough.dt * 1e-2 * (u**2).sum()
-    true = integral + 1e3 * ((state[:2] - [0.6, -0.4]) ** 2).sum() + 10.0 * (state[2:] ** 2).sum()
+    times, u = rough.dt * np.arange(31), plan.controls
+    held = lambda k, q, v: lambda t: u[k]  # noqa: E731
+    motion = exact(rough.scene, rough.q0, rough.v0, times, held, stiff=True, rtol=1e-8)
+    q, v = motion.q[-1], motion.v[-1]
+    true = rough.dt * 1e-2 * (u**2).sum() + 1e3 * ((q - [0.6, -0.4]) ** 2).sum() + 10.0 * (v**2).sum()
     assert found.open_loop_cost == pytest.approx(true, rel=1e-4)
 
 
@@ -151,18 +107,13 @@ def test_noise_beyond_the_width_of_friction_is_reported():
 
 
 def test_an_arm_comes_to_rest():
-    """All joints of an arm under friction that holds it, against SciPy; its energy never rises on the way."""
     robot = vp.load_robot("ur5")
     scene = vp.Scene(robot, gravity=False, forces=vp.CoulombFriction([8.0, 8.0, 5.0, 2.0, 2.0, 1.0], 1e-2))
     begin, speed = np.array([0.0, -1.2, 1.5, -0.5, 0.3, 0.2]), np.array([1.0, 1.0, -1.0, 1.0, 2.0, 2.0])
 
-    def slope(_, x):
-        return np.concatenate([x[6:], accelerations(scene, x[:6], x[6:], np.zeros(6))])
-
-    times = np.linspace(0.0, 0.6, 13)
-    exact = solve_ivp(slope, (0.0, 0.6), np.append(begin, speed), "Radau", t_eval=times, rtol=1e-8, atol=1e-10).y.T
+    true = exact(scene, begin, speed, np.linspace(0.0, 0.6, 13), stiff=True, rtol=1e-8).q
     for integrator, error in ((vp.Radau(3), 2e-6), (vp.Gauss(3), 2e-6), (vp.Midpoint(), 2e-5)):
         motion = vp.simulate(scene, begin, speed, dt=1e-3, steps=600, integrator=integrator)
-        np.testing.assert_allclose(motion.q[::50], exact[:, :6], atol=error)
+        np.testing.assert_allclose(motion.q[::50], true, atol=error)
         assert np.abs(motion.v[-1]).max() < 1e-6
         assert np.diff(motion.energy).max() <= 1e-12 * motion.energy[0]

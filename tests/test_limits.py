@@ -3,16 +3,16 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from mechanisms import joint, link, mimic, write_urdf
+from mechanisms import joint, link, mimic, random_tree, write_urdf
 
 import varpin as vp
+from varpin.model.chain import rod_chain
 
 GRAVITY = 9.81
 EPS = np.finfo(float).eps
 
 
 def built(*bodies):
-    """A chain of (joint model, placement, inertia)."""
     model, joint = pin.Model(), 0
     for k, (kind, offset, inertia) in enumerate(bodies):
         joint = model.addJoint(joint, kind, pin.SE3(np.eye(3), np.array(offset, dtype=float)), f"joint{k}")
@@ -24,16 +24,11 @@ def rod(mass=1.0):
     return pin.Inertia(mass, np.array([0.5, 0.0, 0.0]), np.diag([0.0, mass / 12.0, mass / 12.0]))
 
 
-def chain(masses):
-    return built(*((pin.JointModelRY(), [float(k > 0), 0, 0], rod(m)) for k, m in enumerate(masses)))
-
-
 def carriage(mass):
     return pin.Inertia.FromSphere(mass, 0.1)
 
 
 def gantry():
-    """Three sliders on each other, the second one's placement far away, and a double pendulum on them."""
     return built(
         (pin.JointModelPX(), [0, 0, 0], carriage(3.0)),
         (pin.JointModelPY(), [0, 0, 5e3], carriage(2.0)),
@@ -55,7 +50,6 @@ def test_sliders_on_sliders_keep_their_digits_far_out():
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)])
 def test_a_million_turns_change_nothing(integrator):
-    """A double pendulum that starts a million turns on swings as at home, and shows the turns."""
     scene, turns = vp.Scene(vp.planar_chain(2)), 2.0 * np.pi * 2.0**20
     home, away = (
         vp.simulate(scene, start, [0.0, 0.0], dt=1e-2, steps=100, integrator=integrator)
@@ -79,7 +73,7 @@ def test_angles_are_continuous_over_turns():
 @pytest.mark.parametrize("up", [False, True])
 def test_mass_ratio_of_a_million(up, integrator):
     masses = np.logspace(0, 6, 20)
-    scene = vp.Scene(chain(masses if up else masses[::-1]))
+    scene = vp.Scene(rod_chain([1.0] * 20, masses if up else masses[::-1]))
     motion = vp.simulate(scene, np.zeros(20), np.zeros(20), dt=1e-3, steps=100, integrator=integrator)
     work = motion.statistics
     whole = work.substeps == 1
@@ -154,37 +148,12 @@ def test_a_heavy_wheel_does_not_hide_what_it_carries(dt):
     assert np.abs(np.array(energies) - energies[0]).max() < 0.1 * unit
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("dt", [0.01, 0.05, 0.2, 0.5])
-@pytest.mark.parametrize("links", [2, 3, 5])
-def test_chains_at_coarse_steps_keep_their_energy(links, dt):
-    scene = vp.Scene(vp.planar_chain(links))
-    motion = vp.simulate(scene, np.zeros(links), np.zeros(links), dt=dt, steps=100_000)
-    error = np.abs(motion.energy - motion.energy[0]) / (GRAVITY * links**2 / 2)
-    assert error.max() < 0.1
-    assert error.max() < 0.02 or motion.statistics.split_steps > 0
-
-
-def mixed_chain(rng, heavy, light):
-    """Sliders and hinges about skew axes, the first ones ten thousand times as heavy as the others."""
-    kinds = [pin.JointModelPX, pin.JointModelPY, pin.JointModelPZ, pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ]
-    model = pin.Model()
-    for k in range(heavy + light):
-        parent = int(rng.integers(0, k + 1)) if rng.uniform() < 0.3 else k
-        place = pin.SE3(pin.exp3(rng.normal(size=3)), rng.normal(size=3))
-        joint = model.addJoint(parent, kinds[rng.integers(6)](), place, f"joint{k}")
-        scale = 1.0 if k < heavy else 1e-4
-        inertia = pin.Inertia(scale * rng.uniform(0.5, 2), 0.3 * rng.normal(size=3), scale * np.diag([0.1, 0.15, 0.2]))
-        model.appendBodyToJoint(joint, inertia, pin.SE3.Identity())
-    return vp.load_robot(model)
-
-
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)], ids=str)
 def test_light_parts_that_slide_and_turn_have_sound_balances(integrator):
     """Small steps of whatever rides on whatever are accepted whole: the balance of a light part closes."""
     rng, parts = np.random.default_rng(0), 0
-    for _ in range(40):
-        robot = mixed_chain(rng, int(rng.integers(1, 3)), int(rng.integers(1, 4)))
+    for seed in range(40):
+        robot = vp.load_robot(random_tree(seed, 2 + seed % 4, armature=False, ratio=1e-6))
         parts += robot.tree.loads.size
         scene, n = vp.Scene(robot, gravity=6.0 * rng.normal(size=3), damping=1e-6), robot.dof
         q, v = rng.uniform(-1.0, 1.0, (2, n))
@@ -219,34 +188,3 @@ def test_what_dies_out_away_from_zero_ends_at_rest(integrator, options, controls
     assert motion.q[-1, 0] == pytest.approx(end, abs=1e-14)
     assert abs(motion.v[-1, 0]) < 1e-13
     assert motion.statistics.split_steps == 0
-
-
-def test_chains_come_to_rest_on_springs_and_dampers():
-    rng = np.random.default_rng(5)
-    for _ in range(12):
-        n = int(rng.integers(1, 4))
-        scene = vp.Scene(
-            vp.planar_chain(n),
-            gravity=False,
-            stiffness=10.0 ** rng.uniform(0.0, 3.0, n),
-            damping=10.0 ** rng.uniform(0.5, 1.5, n),
-            rest=rng.uniform(-1.0, 1.0, n),
-        )
-        motion = vp.simulate(scene, np.zeros(n), np.zeros(n), dt=5e-3, steps=4000, check=False)
-        assert motion.statistics.substeps[3000:].max() == 1
-
-
-@pytest.mark.parametrize(("end", "words"), [(0.5, "its JointStop gives way"), (0.9, "nothing stops it there")])
-def test_a_passed_limit_is_that_of_the_robot(end, words):
-    """Also beside a stop, which gives way by its width: the depth is counted from the description's limit."""
-    model = pin.Model()
-    model.addJoint(0, pin.JointModelRY(), pin.SE3.Identity(), "swing")
-    model.appendBodyToJoint(1, rod(), pin.SE3.Identity())
-    model.lowerPositionLimit[:], model.upperPositionLimit[:] = -2.0, 0.5
-    scene = vp.Scene(vp.load_robot(model), gravity=False, forces=vp.JointStop(20.0, 1.0, lower=-2.0, upper=end))
-    motion = vp.simulate(scene, [0.0], [2.0], dt=1e-3, steps=1000)
-    (told,) = [finding for finding in motion.warnings if "position limit" in finding]
-    depth = motion.q.max() - 0.5
-    assert f"limit 0.5 rad by {depth:.3g} at" in told
-    assert words in told
-    assert told.value == pytest.approx(depth, rel=1e-12)

@@ -23,12 +23,10 @@ INERTIA = 1.0 / 3.0  # of the rod about its joint
 
 
 def told(motion):
-    """The warnings of a motion about its control loop; a motion that cannot go on has them, too."""
     return about(motion.warnings, KIND)
 
 
 def run(scene, q, v, law, **options):
-    """The motion, up to a step that fails."""
     try:
         return vp.simulate(scene, q, v, controls=law, **options)
     except vp.StepFailure as failure:
@@ -59,33 +57,26 @@ def radius(scene, K, period, guess):
     return np.abs(np.linalg.eigvals(step[:, : 2 * n] + step[:, 2 * n :] @ K)).max()
 
 
-@pytest.mark.parametrize("share", [0.9, 0.995, 1.005, 1.1])
 @pytest.mark.parametrize("period", [1, 3])
-def test_a_damper_is_stable_up_to_two_inertias_a_period(share, period):
-    """A double integrator with zero-order hold: v is multiplied by 1 - kd h / I."""
-    kd = 2.0 * share * INERTIA / (4e-3 * period)
-    motion = run(ROD, [0.3], [0.2], pd(0.0, kd), dt=4e-3, steps=60 * period, period=period)
-    assert bool(told(motion)) == (share > 1.0), motion.warnings
-    assert len(naming(told(motion), f"{2.0 * share - 1.0:.4g}", f"{4e-3 * period:.4g} s")) == (share > 1.0)
-
-
-@pytest.mark.parametrize(("kp", "kd"), [(10, 30), (300, 1), (300, 1.4), (300, 1.6), (300, 66), (300, 67), (9e3, 60)])
-def test_jury_conditions(kp, kd):
+@pytest.mark.parametrize(
+    ("kp", "kd"), [(0, 66), (0, 67), (10, 30), (300, 1), (300, 1.4), (300, 1.6), (300, 66), (300, 67), (9e3, 60)]
+)
+def test_jury_conditions(kp, kd, period):
     """z^2 - (2 - b - a / 2) z + 1 - b + a / 2 with a = kp h^2 / I, b = kd h / I: stable for a / 2 < b < 2."""
     h = 1e-2
     a, b = kp * h**2 / INERTIA, kd * h / INERTIA
     size = np.abs(np.roots([1.0, -(2.0 - b - 0.5 * a), 1.0 - b + 0.5 * a])).max()
-    assert (size < 1.0) == (0.5 * a < b < 2.0)
-    motion = run(ROD, [0.3], [0.0], pd(kp, kd), dt=h, steps=150)
-    assert bool(told(motion)) == (size > 1.0), (size, motion.warnings)
+    stable = 0.5 * a < b < 2.0
+    motion = run(ROD, [0.3], [0.2 * (kp == 0)], pd(kp, kd), dt=h / period, steps=150 * period, period=period)
+    assert bool(told(motion)) != stable, (size, motion.warnings)
     for finding in unstable_loop(ROD, motion):
-        assert finding.kind == KIND
-        assert finding.joint == "joint1"
+        assert (finding.kind, finding.joint) == (KIND, "joint1")
         np.testing.assert_allclose(finding.value, size, rtol=1e-6)
+        assert naming([finding], f"{size:.4g}", "0.01 s")
         # The period that is stable, at most a tenth short.
-        limit = min(2.0 * INERTIA / kd, 2.0 * kd / kp)
-        stable = float(finding.split("below ")[1].split(" s")[0])
-        assert 0.89 * limit < stable < 1.001 * limit
+        limit = min(2.0 * INERTIA / kd, 2.0 * kd / max(kp, 1e-9))
+        shorter = float(finding.split("below ")[1].split(" s")[0])
+        assert 0.89 * limit < shorter < 1.001 * limit
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.RungeKutta4()], ids=str)
@@ -152,22 +143,6 @@ def test_the_count_of_turns():
     assert naming([finding], "joint1", f"{finding.value:.0f} times", "300 periods", "0.01 s")
 
 
-def test_a_law_without_limits_does_not_go_from_one_to_the_other():
-    """A goal that swings 19 times a second is followed, as well as that goes."""
-
-    def law(t, q, v):
-        return -100.0 * np.sin(q - np.sin(120.0 * t)) - 5.0 * v
-
-    assert not told(run(ROD, [0.0], [0.0], law, dt=1e-2, steps=300))
-
-
-def test_growth_that_the_law_would_have_at_any_period_is_not_its_own():
-    """A spring too weak to hold a rod upright."""
-    motion = run(PENDULUM, [0.02 - np.pi / 2], [0.0], pd(2.0, 0.5, goal=-np.pi / 2), dt=5e-3, steps=300)
-    assert abs(motion.q[-1, 0] + np.pi / 2) > 0.05
-    assert not told(motion)
-
-
 def swing_up(t, q, v):
     """It pumps from limit to limit, catches the pendulum upright and holds it."""
     if np.sin(q[0]) < -0.8:
@@ -187,6 +162,8 @@ STABLE = {
     "clipped": (PENDULUM, 0, pd(1e3, 50.0, limit=20.0)),
     "falls, weak damping": (PENDULUM, np.pi / 2 - 1e-6, lambda t, q, v: -0.1 * v),
     "falls, weak springs": (PENDULUM, np.pi / 2 - 1e-6, pd(1.0, 0.1, np.pi / 2)),
+    "spring too weak to hold it upright": (PENDULUM, 0.02 - np.pi / 2, pd(2.0, 0.5, goal=-np.pi / 2)),
+    "goal that swings fast": (ROD, 0, lambda t, q, v: -100 * np.sin(q - np.sin(120 * t)) - 5 * v),
     "goal that swings": (TWO, 0, lambda t, q, v: -300 * (q - np.sin(3 * t)) - 30 * v),
     "goal that runs away": (ROD, 0, lambda t, q, v: -100 * (q - t**3) - 10 * (v - 3 * t**2)),
     "gravity alone compensated": (TWO, 0.3, lambda t, q, v: -vp.lagrangian_jet(TWO, q, np.zeros(2)).Lq - 2.0 * v),
@@ -232,16 +209,34 @@ def test_noise_hides_nothing(kd, unstable):
     assert bool(told(run(scene, [0, 0], [0, 0], pd(300.0, kd), dt=1e-2, steps=200, rng=0))) == unstable
 
 
-@pytest.mark.parametrize(("kd", "unstable"), [(1.0, True), (40.0, False)])
-def test_a_four_bar(kd, unstable):
-    """The spring of a sampled law pumps energy in: within constraints as without."""
-    joint = vp.PointOnPoint("tip", (1.3, 0.0, 0.2), axes="xz")
-    scene = vp.Scene(vp.planar_chain(3), damping=0.05, constraints=joint, actuation=["joint1"])
-    goal = vp.assemble(scene, [-1.5, 1.5, 1.5])
-    start = vp.assemble(scene, goal + 0.02 * np.arange(1, 4))
-    law = pd(300.0, kd, goal[:1])
-    motion = run(scene, start, np.zeros(3), lambda t, q, v: law(t, q[:1], v[:1]), dt=1e-2, steps=80, period=2)
+LOOPS = {"four-bar": ((1.3, 0.0, 0.2), [-1.5, 1.5, 1.5], ["joint1"]),
+         "five-bar": ((1.6, 0.0, 0.3), [-1.0, 1.0, 1.0, 1.0], ["joint1", "joint4"])}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "kp", "kd", "steps", "unstable"),
+    [
+        ("four-bar", 300.0, 1.0, 800, True),
+        ("four-bar", 300.0, 40.0, 800, False),
+        ("five-bar", 30.0, 1.0, 800, False),
+        ("five-bar", 30.0, 160.0, 80, True),
+    ],
+)
+def test_closed_loops(name, kp, kd, steps, unstable):
+    """The spring of a sampled law pumps energy in, within constraints as without: the motion itself says whether."""
+    place, seed, driven = LOOPS[name]
+    joint = vp.PointOnPoint("tip", place, axes="xz")
+    scene = vp.Scene(vp.planar_chain(len(seed)), damping=0.05, constraints=joint, actuation=driven)
+    goal = vp.assemble(scene, seed)
+    start = vp.assemble(scene, goal + 0.02 * np.arange(1, len(seed) + 1))
+
+    def law(t, q, v):
+        return scene.actuation.T @ (kp * (goal - q) - kd * v)
+
+    motion = run(scene, start, np.zeros(len(seed)), law, dt=1e-2, steps=steps, period=2)
     assert bool(told(motion)) == unstable, motion.warnings
+    first, *_, last = np.array_split(np.abs(motion.v), 4)
+    assert (last.max() > first.max()) == unstable
 
 
 def test_policies():
@@ -269,21 +264,6 @@ def test_the_sentence(caplog):
 def test_a_step_that_fails_under_a_law_names_its_gains():
     with refused(vp.StepFailure, "lower gains"):
         vp.simulate(TWO, [0, 0], [0, 0], dt=5e-3, steps=400, controls=pd(1e5, 1e3))
-
-
-def test_no_motion_ends_silently_above_a_thousand_times_its_start():
-    """Whatever the law: torques that grow on and on."""
-    for kp, kd in ((10.0, 69.0), (1e3, 0.0), (1e4, 10.0), (3e3, 20.0)):
-        for shape in (lambda x: x, lambda x: x * (1.0 + 0.1 * np.sin(x)), lambda x: x + 0.1 * np.cos(x)):
-
-            def law(t, q, v, kp=kp, kd=kd, shape=shape):
-                return shape(-kp * (q - 1) - kd * v)
-
-            try:
-                motion = run(ROD, [0.0], [0.0], law, dt=1e-2, steps=400)
-            except vp.ControlError:
-                continue
-            assert told(motion) or np.abs(motion.u[-20:]).max() <= 1e3 * np.abs(motion.u[0]).max()
 
 
 def test_an_ensemble_whose_loop_is_unstable_says_so():

@@ -3,7 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from mechanisms import mass_matrix
+from oracles import Mechanism
 from refusals import refused
 
 import varpin as vp
@@ -99,13 +99,13 @@ def test_payload_is_what_pinocchio_makes_of_it(load):
     model, data = bare.model, bare.model.createData()
     J = pin.computeFrameJacobian(model, data, bare.configuration(q), model.getFrameId("tool0"), pin.LOCAL)
     body = pin.Inertia(1.5, np.array([0.01, -0.02, 0.1]), inertia).matrix()
-    expected = mass_matrix(bare, q, data) + J.T @ body @ J
-    np.testing.assert_allclose(mass_matrix(loaded, q, loaded.model.createData()), expected, rtol=1e-12, atol=1e-13)
+    expected = Mechanism(vp.Scene(bare)).mass_matrix(q) + J.T @ body @ J
+    found = Mechanism(vp.Scene(loaded)).mass_matrix(q)
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-13)
     # Locking a joint does not lose it.
     held = vp.load_robot("ur5", payload=load_, lock={"wrist_3_joint": q[5]})
-    np.testing.assert_allclose(
-        mass_matrix(held, q[:5], held.model.createData()), expected[:5, :5], rtol=1e-12, atol=1e-13
-    )
+    found = Mechanism(vp.Scene(held)).mass_matrix(q[:5])
+    np.testing.assert_allclose(found, expected[:5, :5], rtol=1e-12, atol=1e-13)
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from oracles import slope
 
 import varpin as vp
-
-WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 
 ARMS = {
     "double_pendulum": (0.1, 8.0, {"damping": 0.02}),
@@ -27,7 +26,6 @@ def parts_of(motion):
 
 
 def composed(scene, integrator, dt, halvings, q, p, u):
-    """(q1, p1) of plain steps without guards, one after another."""
     plain = type(integrator)(**{**vars(integrator), "guard": None})
     for level in halvings:
         step = vp.simulate(
@@ -78,7 +76,6 @@ def taken_otherwise(scene, motion, integrator):
 
 @each_case
 def test_parts_are_those_of_the_motion(name, integrator, seed):
-    """Plain steps of these lengths, one after another, lead from node to node."""
     scene, motion = moving(name, integrator, seed)
     assert motion.statistics.split_steps > 3
     parts = parts_of(motion)
@@ -92,55 +89,43 @@ def test_parts_are_those_of_the_motion(name, integrator, seed):
 
 @each_case
 def test_derivatives_are_those_of_the_parts_taken(name, integrator, seed):
-    """Against eighth-order differences of plain steps in the same parts, which a fresh start would not have taken."""
+    """Against differences of plain steps in the same parts, which a fresh start would not have taken."""
     scene, motion = moving(name, integrator, seed)
     k = next(taken_otherwise(scene, motion, integrator))
-    lin = vp.linearize(scene, motion)
-    n, u = scene.robot.dof, motion.u[k]
+    lin, n, rng = vp.linearize(scene, motion), scene.robot.dof, np.random.default_rng(0)
     units = units_of(scene, motion.q[k], motion.v[k])
-    point = np.concatenate([motion.q[k], motion.p[k], u])
+    point = np.concatenate([motion.q[k], motion.p[k], motion.u[k]])
     given = np.hstack([lin.A[k], lin.B[k]]) * units / units[: 2 * n, None]
-    sizes = 3e-3 / np.abs(given).max(axis=0)
 
     def end(y):
         return composed(scene, integrator, motion.dt, parts_of(motion)[k], y[:n], y[n : 2 * n], y[2 * n :])
 
-    expected = np.zeros_like(given)
-    for c, e in enumerate(np.diag(sizes * units)):
-        slope = sum(w * (end(point + i * e) - end(point - i * e)) for i, w in WEIGHTS.items()) / sizes[c]
-        expected[:, c] = slope / units[: 2 * n]
     for block in (slice(0, 2 * n), slice(2 * n, 3 * n)):
-        error = np.abs(given[:, block] - expected[:, block]).max()
-        assert error < 1e-8 * np.abs(expected[:, block]).max()
+        e = np.zeros(3 * n)
+        e[block] = rng.uniform(-1.0, 1.0, e[block].size)
+        expected = slope(end, point, e * units, 3e-3 / np.abs(given[:, block]).max()) / units[: 2 * n]
+        np.testing.assert_allclose(given @ e, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
     np.testing.assert_array_equal(lin.K[k], lin.A[k][:, n:])
 
 
 @pytest.mark.parametrize(("name", "integrator", "seed"), CASES[::3], ids=str)
 def test_second_derivatives_are_those_of_the_parts_taken(name, integrator, seed):
-    """Against differences of the first, the parts held."""
     scene, motion = moving(name, integrator, seed)
     k = next(taken_otherwise(scene, motion, integrator))
-    step, n = motion.part(k, k + 1), scene.robot.dof
+    step, n, rng = motion.part(k, k + 1), scene.robot.dof, np.random.default_rng(seed)
     units = units_of(scene, step.q[0], step.v[0])
-    z = np.random.default_rng(seed).normal(size=2 * n) / units[: 2 * n]
+    z, e, other = rng.normal(size=2 * n) / units[: 2 * n], *(rng.uniform(-1.0, 1.0, (2, 3 * n)) * units)
     second = vp.second_order(scene, step, z)
-    given = np.block([[second.xx[0], second.ux[0].T], [second.ux[0], second.uu[0]]]) * np.outer(units, units)
-    A = vp.linearize(scene, step).A[0] * units[: 2 * n] / units[: 2 * n, None]
-    size = 3e-3 / max(1.0, np.abs(A).max())
+    given = np.block([[second.xx[0], second.ux[0].T], [second.ux[0], second.uu[0]]])
 
     def gradient(y):
         q, p = (np.vstack([y[i : i + n], y[i : i + n]]) for i in (0, n))
         lin = vp.linearize(scene, replace(step, q=q, p=p, u=y[None, 2 * n :]))
-        return (z @ np.hstack([lin.A[0], lin.B[0]])) * units
+        return z @ np.hstack([lin.A[0], lin.B[0]]) @ other
 
-    point = np.concatenate([step.q[0], step.p[0], step.u[0]])
-    expected = np.array(
-        [
-            sum(w * (gradient(point + i * e) - gradient(point - i * e)) for i, w in WEIGHTS.items()) / size
-            for e in size * np.diag(units)
-        ]
-    )
-    assert np.abs(given - expected).max() < 1e-7 * np.abs(expected).max()
+    size = 3e-3 / max(1.0, np.abs(vp.linearize(scene, step).A[0] * units[: 2 * n] / units[: 2 * n, None]).max())
+    expected = slope(gradient, np.concatenate([step.q[0], step.p[0], step.u[0]]), e, size)
+    assert abs(other @ given @ e - expected) < 1e-7 * np.abs(given * np.outer(units, units)).max()
 
 
 def test_parts_are_kept_however_a_motion_is_made():
@@ -170,18 +155,13 @@ def test_noisy_steps_are_taken_in_parts_without_their_kick(kick):
     checked = 0
     for k, halvings in enumerate(parts_of(motion)[:4]):
         units = units_of(scene, motion.q[k], motion.v[k])[:4]
-        point = np.concatenate([motion.q[k], motion.p[k]])
-        lengths = halvings if len(halvings) else [0]
-        size = 1e-3 / max(1.0, np.abs(lin.A[k] * units / units[:, None]).max())
+        e, lengths = units * np.random.default_rng(k).uniform(-1.0, 1.0, 4), halvings if len(halvings) else [0]
 
         def end(y, k=k, lengths=lengths):
             return composed(scene, integrator, motion.dt, lengths, y[:2], y[2:], motion.u[k])
 
-        slopes = [
-            sum(w * (end(point + i * e) - end(point - i * e)) for i, w in WEIGHTS.items()) / size
-            for e in size * np.diag(units)
-        ]
-        expected = np.transpose(slopes) / units
-        np.testing.assert_allclose(lin.A[k], expected, rtol=0, atol=1e-7 * np.abs(expected).max())
+        size = 1e-3 / max(1.0, np.abs(lin.A[k] * units / units[:, None]).max())
+        expected = slope(end, np.append(motion.q[k], motion.p[k]), e, size)
+        np.testing.assert_allclose(lin.A[k] @ e, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
         checked += len(halvings) > 1
     assert checked > 1

@@ -14,7 +14,6 @@ rng = np.random.default_rng(20)
 
 
 def pair(robot, *, noise=None, fields=textbook.no_noise, gravity=(0.0, 0.0, -9.81), **surroundings):
-    """The same arm as a scene and as a system of the textbook."""
     model = robot.model.copy()
     model.gravity = pin.Motion(np.array(gravity), np.zeros(3))
     scene = vp.Scene(robot, gravity=gravity, noise=noise, **surroundings)
@@ -52,16 +51,16 @@ def test_motions_and_linearizations_are_those_of_the_textbook(arm, alpha):
                 assert gap <= 1e-8 * np.abs(expected[part]).max(), (name, k)
 
 
-@pytest.mark.parametrize(
-    ("noise", "fields"),
-    [
-        (vp.AdditiveNoise(1e-2), textbook.white_noise(1e-2)),
-        (vp.ControlNoise(3e-2), textbook.control_noise(3e-2)),
-        (vp.StateNoise(5e-2), textbook.state_noise(5e-2, np.array([0.4, 0.1, -0.2]))),
-    ],
-    ids=["white", "control", "state"],
-)
-def test_noise_acts_as_in_the_textbook(noise, fields):
+NOISES = {
+    "white": (vp.AdditiveNoise(1e-2), textbook.white_noise(1e-2)),
+    "control": (vp.ControlNoise(3e-2), textbook.control_noise(3e-2)),
+    "state": (vp.StateNoise(5e-2), textbook.state_noise(5e-2, np.array([0.4, 0.1, -0.2]))),
+}
+
+
+@pytest.mark.parametrize("name", NOISES)
+def test_noise_acts_as_in_the_textbook(name):
+    noise, fields = NOISES[name]
     scene, system = pair(vp.planar_chain(3), noise=noise, fields=fields)
     q0, h, N = np.array([0.4, 0.1, -0.2]), 5e-3, 20
     u, dw = rng.normal(size=(N, 3)), np.sqrt(h) * rng.normal(size=(N, 3))
@@ -77,12 +76,9 @@ def test_noise_acts_as_in_the_textbook(noise, fields):
         assert np.abs((ends[0] - ends[1]) / 2e-2 - own.K @ own.F[:, i]).max() <= 1e-7 * np.abs(own.K).max()
 
 
-@pytest.mark.parametrize("case", ["white", "control"])
-def test_a_plan_is_that_of_the_textbook(case):
-    noise, fields = {
-        "white": (vp.AdditiveNoise(1e-2), textbook.white_noise(1e-2)),
-        "control": (vp.ControlNoise(2e-2), textbook.control_noise(2e-2)),
-    }[case]
+@pytest.mark.parametrize("name", ["white", "control"])
+def test_a_plan_is_that_of_the_textbook(name):
+    noise, fields = NOISES[name]
     scene, system = pair(vp.planar_chain(2), noise=noise, fields=fields, gravity=(0.0, 0.0, 0.0))
 
     def reference(t):
@@ -100,24 +96,6 @@ def test_a_plan_is_that_of_the_textbook(case):
     assert ours.noise_cost == pytest.approx(plan.noise_cost, rel=1e-4)
     assert np.abs(ours.controls - plan.motion.u).max() <= 1e-3 * np.abs(plan.motion.u).max()
     assert np.abs(ours.gains - plan.policy.feedback).max() <= 1e-3 * np.abs(plan.policy.feedback).max()
-
-
-def test_a_backward_pass_without_noise_is_riccatis():
-    # Of a linear arm, a slider on a spring, it is exact: one step of length 1 is the optimum.
-    model = pin.Model()
-    joint = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "slider")
-    model.appendBodyToJoint(joint, pin.Inertia(2.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
-    system = textbook.system(model, damping=0.3, stiffness=5.0)
-    cost = textbook.TrackingCost(lambda t: np.array([1.0]))
-    h, N = 0.05, 30
-    plan = textbook.solve(system, cost, np.zeros(1), np.zeros(1), np.zeros((N, 1)), h)
-    assert plan.iterations == 1
-    lin = textbook.linearize_step(system, np.zeros(1), np.zeros(1), np.zeros(1), h)
-    P, Q, R = np.diag([2.0, 0.0]), h * np.diag([20.0, 0.0]), np.array([[0.2 * h]])
-    for k in range(N - 1, -1, -1):
-        G = -np.linalg.solve(R + lin.B.T @ P @ lin.B, lin.B.T @ P @ lin.A)
-        assert plan.policy.feedback[k] == pytest.approx(G, rel=1e-9)
-        P = Q + lin.A.T @ P @ lin.A + lin.A.T @ P @ lin.B @ G
 
 
 def test_models_of_joints_with_two_variables_are_refused():

@@ -1,4 +1,4 @@
-"""Wiener increments, and motions driven by them: replay, strong and weak order, the Stratonovich limit, Langevin."""
+"""Wiener increments, and motions driven by them: strong and weak order, and the stationary law of an oscillator."""
 
 import numpy as np
 import pytest
@@ -114,7 +114,6 @@ def oscillator():
 
 
 def map_of(scene, dt, integrator):
-    """The linear map of one step: A and G."""
     lin = vp.linearize(
         scene, vp.simulate(scene, [0.1], [0], dt=dt, steps=1, integrator=integrator), integrator=integrator
     )
@@ -137,23 +136,6 @@ def test_stationary_law_of_the_linear_oscillator(dt):
     assert left[1, 1] == pytest.approx(MASS * HEAT * (cold + growth), rel=1e-12)
 
 
-@BOTH
-def test_long_run_of_the_linear_oscillator(kick):
-    """Time averages of q^2 and p^2 over 64 paths within 4 standard errors of the closed form, and of no other."""
-    dt, paths = 0.25, 64
-    end = vp.simulate_ensemble(
-        oscillator(), [0.0], [0.0], dt=dt, steps=3000, paths=paths, rng=3, integrator=vp.Midpoint(kick=kick)
-    )
-    growth = dt**2 * STIFFNESS / (4 * MASS)
-    squares = STIFFNESS * (end.q[:, 200:, 0] ** 2).mean(axis=1) / HEAT
-    error = squares.std(ddof=1) / np.sqrt(paths)
-    assert abs(squares.mean() - (1.0 + growth * (kick == "left"))) < 4.0 * error
-    assert abs(squares.mean() - (1.0 + growth * (kick == "split"))) > 10.0 * error
-    if kick == "split":
-        squares = (end.p[:, 200:, 0] ** 2).mean(axis=1) / (MASS * HEAT)
-        assert abs(squares.mean() - 1.0) < 4.0 * squares.std(ddof=1) / np.sqrt(paths)
-
-
 @pytest.mark.parametrize(("kick", "order", "coarse"), [("left", 1.0, 1024), ("split", 2.0, 64)])
 def test_weak_order_of_the_mean_energy(kick, order, coarse):
     """From rest towards equilibrium: the mean energy at t = 1 s from the map's moments, against the exact law."""
@@ -174,103 +156,3 @@ def test_weak_order_of_the_mean_energy(kick, order, coarse):
         errors.append(abs(energy[0] - energy[1]))
     slopes = np.log2(np.divide(errors[:-1], errors[1:]))
     assert (np.abs(slopes - order) < 0.1).all(), (slopes, errors)
-
-
-RATE = 1.0  # of v in the geometric noise below [s^-0.5]
-
-
-def geometric_logs(kick, dv, steps, paths=40):
-    """Log |v(1 s)| of dv = RATE v o dw from v = 1, and w(1 s)."""
-    mass = 0.5
-    noise = vp.CustomNoise(lambda q, v, u: RATE * mass * v[:, None], processes=1, dv=dv, check=dv is not None)
-    scene = vp.Scene(slider(mass), gravity=False, noise=noise)
-    runs = [
-        vp.simulate(
-            scene, [0], [1], dt=1 / steps, steps=steps, rng=np.random.default_rng([2, path]),
-            integrator=vp.Midpoint(kick=kick),
-        )
-        for path in range(paths)
-    ]  # fmt: skip
-    return np.log([abs(run.v[-1, 0]) for run in runs]), np.array([run.dw.sum() for run in runs])
-
-
-def derivative_of_geometric_noise(q, v, u):
-    return np.full((1, 1, 1), 0.5 * RATE)
-
-
-@pytest.mark.parametrize("kick", ["left", pytest.param("split", marks=pytest.mark.slow)])
-def test_velocity_dependent_noise_converges_to_the_stratonovich_limit(kick):
-    """There v = exp(RATE w) on every path; log v - RATE w is 0 on average, at ever smaller spread."""
-    spreads = []
-    for steps in (50, 200):
-        logs, w = geometric_logs(kick, derivative_of_geometric_noise, steps)
-        error = logs - RATE * w
-        spreads.append(error.std(ddof=1))
-        assert abs(error.mean()) < 4.0 * error.std(ddof=1) / np.sqrt(len(error))
-        assert abs(logs.mean()) < 4.0 * logs.std(ddof=1) / np.sqrt(len(logs))
-    assert spreads[1] < 0.65 * spreads[0]
-
-
-@BOTH
-def test_a_kick_has_the_correction_of_its_parts(kick):
-    """Of 1/2 over a second, a half of it for a split one: more or less of it moves log v as much."""
-    logs, w = geometric_logs(kick, derivative_of_geometric_noise, 50, paths=10)
-    assert abs((logs - RATE * w).mean()) < 0.2
-
-
-def test_velocity_dependent_noise_without_its_correction_converges_to_the_ito_limit():
-    """Without dv log v - RATE w goes to -RATE^2 t / 2 instead."""
-    for steps in (50, 200):
-        logs, w = geometric_logs("left", None, steps)
-        error = logs - RATE * w
-        deviation = error.std(ddof=1) / np.sqrt(len(error))
-        assert abs(error.mean() + 0.5 * RATE**2) < 4.0 * deviation
-        assert abs(error.mean()) > 20.0 * deviation
-
-
-@pytest.mark.parametrize("part", ["constant", "varying"])
-def test_no_correction_where_fields_do_not_depend_on_the_velocity(part):
-    """A dv of zeros moves no bit, whatever the other fields."""
-    own = {"constant": lambda q, v, u: np.eye(2), "varying": lambda q, v, u: np.diag(q) + u[:, None]}[part]
-    zeros = vp.CustomNoise(own, 2, dv=lambda q, v, u: np.zeros((2, 2, 2)))
-    motions = [
-        vp.simulate(noisy_chain(n), [1, 0], [0, 1], dt=0.01, steps=20, rng=0) for n in (zeros, vp.CustomNoise(own, 2))
-    ]
-    assert motions[0].p.tobytes() == motions[1].p.tobytes()
-
-
-PATHS, HOT = 64, 2.0
-
-
-def mean_energy(friction, kick, dt, duration):
-    """The mean of p v / kT of a hanging rod of 1 m and 1 kg in a bath, over time and paths, and its standard error.
-
-    It is damped by ``friction`` [1/s] times its inertia.
-    """
-    rng, inertia = np.random.default_rng(4), np.array([1.0 / 3.0])
-    q = rng.uniform(-np.pi, np.pi, (4000, 1))
-    weight = np.exp(0.5 * 9.81 * np.sin(q[:, 0]) / HOT)
-    # Starts from the canonical law, by rejection, so that nothing has to burn in.
-    q = q[rng.uniform(size=4000) < weight / weight.max()][:PATHS]
-    v = rng.normal(scale=np.sqrt(HOT / inertia), size=q.shape)
-    damping = friction * inertia
-    scene = vp.Scene(vp.planar_chain(1), damping=damping, noise=vp.AdditiveNoise(np.sqrt(2.0 * damping * HOT)))
-    rng, energy, steps = np.random.default_rng(1), 0.0, round(duration / 20 / dt)
-    # In pieces, whose paths fit into memory.
-    for _ in range(20):
-        piece = vp.simulate_ensemble(
-            scene, q, v, dt=dt, steps=steps, paths=PATHS, rng=rng, integrator=vp.Midpoint(kick=kick)
-        )
-        q, v = piece.q[:, -1], piece.v[:, -1]
-        energy = energy + (piece.p[:, 1:] * piece.v[:, 1:]).sum(axis=2).mean(axis=1) / HOT / 20
-    return energy.mean(), energy.std(ddof=1) / np.sqrt(PATHS)
-
-
-# The left kick leaves nodes cold by dt * damping / inertia, so its limit shows at weak friction.
-@pytest.mark.parametrize(("kick", "friction"), [("split", 0.6), ("left", 0.4)])
-@pytest.mark.parametrize(("dt", "duration"), [pytest.param(5e-3, 200.0, marks=pytest.mark.slow), (2e-2, 400.0)])
-def test_langevin_equipartition(kick, friction, dt, duration):
-    """The time average of p'M^-1 p is n kT within 4 standard errors."""
-    mean, error = mean_energy(friction, kick, dt, duration)
-    assert error < 0.05
-    assert abs(mean - 1.0) < 4.0 * error

@@ -18,6 +18,7 @@ from mechanisms import crank_and_slider, random_tree, slider
 from oracles import Mechanism, Path
 
 import varpin as vp
+from varpin.model.chain import rod_chain
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,21 +101,6 @@ def tree(seed: int, bodies: int, **scene: object) -> Callable[[], vp.Scene]:
     return lambda: vp.Scene(vp.load_robot(random_tree(seed, bodies)), damping=0.0, **scene)
 
 
-def cart() -> vp.Robot:
-    """A carriage on a rail along x that carries two rods."""
-    model = pin.Model()
-    joint = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "rail")
-    model.appendBodyToJoint(joint, pin.Inertia.FromSphere(2.0, 0.1), pin.SE3.Identity())
-    place = pin.SE3.Identity()
-    for k in range(2):
-        joint = model.addJoint(joint, pin.JointModelRY(), place, f"rod{k}")
-        rod = pin.Inertia(0.5, np.array([0.3, 0.0, 0.0]), np.diag([1e-4, 0.02, 0.02]))
-        model.appendBodyToJoint(joint, rod, pin.SE3.Identity())
-        place = pin.SE3(np.eye(3), np.array([0.6, 0.0, 0.0]))
-    model.addFrame(pin.Frame("tip", joint, 0, place, pin.FrameType.OP_FRAME))
-    return vp.load_robot(model)
-
-
 def drag(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Coupled, and no gradient."""
     return 0.8 * np.sin(np.roll(q, 1)) - 0.1 * v * np.sqrt(1.0 + v**2) + 0.2 * np.roll(v, -1) * q
@@ -129,7 +115,9 @@ add("double pendulum", chain(2), (0.4, -0.7), (1.0, 0.5))
 add("chain", chain(3), **THREE)
 add("drifting chain", chain(3, gravity=False), **THREE)
 add("tilted chain", chain(3, gravity=(1.5, 3.0, -8.0)), **THREE)
-add("cart", lambda: vp.Scene(cart(), damping=0.0, actuation=["rail"]), (0.2, 0.5, -0.3), (0.5, 1.0, -0.8))
+# A carriage on a rail along x that carries two rods.
+add("cart", lambda: vp.Scene(rod_chain([0.6, 0.6], [0.5, 0.5], rail=2.0), damping=0.0, actuation=["rail"]),
+    (0.2, 0.5, -0.3), (0.5, 1.0, -0.8))  # fmt: skip
 add("mass on a spring", lambda: vp.Scene(slider(2.0), gravity=False, stiffness=30.0), 0.5, 1.0)
 add("tree", tree(3, 7, actuation=np.cos(np.arange(35.0).reshape(7, 5))), 0.2, 0.8, 0.01)
 add("finger", arm("finger"), (0.5, 0.3, 0.2), (4.0, -3.0, 2.0), 5e-3, 2e-5)
@@ -227,8 +215,9 @@ TIP = (1.3, 0.0, 0.2)
 FOUR, FIVE = {"q": (-1.5, 1.5, 1.5), "v": (1.0, 0.0, 0.0)}, {"q": (-1.0, 1.0, 1.0, 1.0), "v": 1.0}
 add("four-bar", chain(3, constraints=vp.PointOnPoint("tip", TIP, "xz")), **FOUR)
 add("five-bar", chain(4, damping=0.3, constraints=vp.PointOnPoint("tip", (1.6, 0.0, 0.3), "xz")), **FIVE)
-add("crank and block", lambda: vp.Scene(crank_and_slider(), constraints=vp.PointOnPoint("tip", "pin", "xz")),
-    (0.7, -0.9, 1.2), (3.0, 0.0, 0.0), 0.01)  # fmt: skip
+# With a row that nothing moves, and one that depends on others.
+TWICE = [vp.PointOnPoint("tip", "pin"), vp.PointOnPlane("tip", "pin", (1.0, 0.5, 1.0))]
+add("crank and block", lambda: vp.Scene(crank_and_slider(), constraints=TWICE), (0.7, -0.9, 1.2), (3.0, 0.0, 0.0), 0.01)
 add("rod", chain(3, constraints=vp.Distance("tip", (0.5, 0.0, 0.5), 1.2)), (-1.0, 0.6, 0.5), 1.0)
 add("cam", chain(3, constraints=vp.JointTie("joint3", "joint1", (0.1, 0.5, -0.3, 0.2))), (-1.0, 0.6, 0.5), 1.0)
 add("line", chain(3, constraints=vp.PointOnLine("tip", (1.0, 0.0, -0.4), (1.0, 0.0, 0.5))), (0.9, -1.1, 0.8), 1.0, 0.01)

@@ -8,6 +8,7 @@
 #include <span>
 #include <vector>
 
+#include "arm.hpp"
 #include "varpin/backward.hpp"
 #include "varpin/constrained.hpp"
 #include "varpin/costs.hpp"
@@ -22,32 +23,9 @@ int allocations = 0;
 constexpr int n = 3, N = 20;
 constexpr double infinity = std::numeric_limits<double>::infinity();
 
-varpin::Mechanism chain() {
-    varpin::Mechanism out;
-    for (int j = 0; j < n; ++j) {
-        out.tree.bodies.push_back({.parent = j - 1,
-                                   .rotation = {{1.0, 0.0, 0.0}, {0.0, 1.0, 0.0}, {0.0, 0.0, 1.0}},
-                                   .translation = {j > 0 ? 1.0 : 0.0, 0.0, 0.0},
-                                   .mass = 1.0,
-                                   .center = {0.5, 0.0, 0.0},
-                                   .inertia = {0.01, 0.0, 0.1, 0.0, 0.0, 0.1},
-                                   .coordinate = j,
-                                   .origin = j == 0});
-    }
-    out.tree.armature = std::vector<double>(n);
-    out.tree.periodic.assign(n, 0);
-    out.tree.group.assign(n, 0);
-    out.tree.groups = 1;
-    out.tree.blocks = {{0, n}};
-    out.gravity = {0.0, -9.81, 0.0};
-    out.controls = n;
-    out.actuation = {{0, 0, 1.0}, {1, 1, 1.0}, {2, 2, 1.0}};
-    return out;
-}
-
-// The same with a spring and a damper from its tip to the world.
+// The chain with a spring and a damper from its tip to the world.
 varpin::Mechanism coupled_chain() {
-    varpin::Mechanism out = chain();
+    varpin::Mechanism out = arm();
     const varpin::Anchor tip{n - 1, {1.0, 0.0, 0.0}};
     out.couplings = {
         {varpin::FrameSpring{tip, {}, {20.0, 20.0, 20.0}, {}}, varpin::FrameDamper{tip, {}, {0.5, 0.5, 0.5}}},
@@ -183,7 +161,7 @@ bool allocates_nothing(const varpin::Mechanism& mechanism) {
                                             {Subject::position, 3, 0, three, {0.0, 0.0, 0.0}},
                                             {Subject::orientation, 3, 0, three, three},
                                             {Subject::twist, 6, 0, six, std::vector<double>(6)},
-                                            {Subject::manipulability, 1, 0, one, {100.0}, {0, 1}},
+                                            {Subject::manipulability, 1, 0, one, {100.0}, {0, 2}},
                                             {Subject::position, 3, 1, three, {0.0, 0.0, 0.0}}}};
     varpin::CostSample sample(costs);
     std::vector<double> own_gradient(size), own_hessian(size * size), values(costs.terms.size());
@@ -199,10 +177,10 @@ bool allocates_nothing(const varpin::Mechanism& mechanism) {
 
 // A chain whose tip slides along a line, from rest.
 bool constrained_steps_allocate_nothing() {
-    varpin::Mechanism mechanism = chain();
-    const varpin::Anchor tip{n - 1, {1.0, 0.0, 0.0}}, across{-1, {0.0, 1.0, 0.0}, true};
+    varpin::Mechanism mechanism = arm();
+    const varpin::Anchor tip{n - 1, 2.0 * mechanism.tree.bodies[n - 1].center}, across{-1, {0.0, 0.0, 1.0}, true};
     const double q0[n] = {0.4, 0.3, -0.5}, v0[n] = {}, h = 0.001;
-    const double height = std::sin(0.4) + std::sin(0.7) + std::sin(0.2);
+    const double height = -std::sin(0.4) - std::sin(0.7) - std::sin(0.2);
     mechanism.constraints = {
         {{{tip}}, {{across}}}, {{.x = 0, .y = 1, .constant = height}}, {}, {}, mechanism.tree.bodies, n};
     varpin::ConstrainedStepper stepper(mechanism, midpoint, {0.0, 1.0}, 0.5, {});
@@ -221,6 +199,6 @@ bool constrained_steps_allocate_nothing() {
 }
 
 int main() {
-    const bool alone = allocates_nothing(chain()), coupled = allocates_nothing(coupled_chain());
+    const bool alone = allocates_nothing(arm()), coupled = allocates_nothing(coupled_chain());
     return alone && coupled && constrained_steps_allocate_nothing() ? 0 : 1;
 }
