@@ -176,62 +176,134 @@ def test_numbers_of_any_size(state, dt, integrator):
         require_finite(vp.simulate(SCENE, *state, dt=dt, steps=3, integrator=integrator))
 
 
-class TestTheCoreGetsWhatFits:
-    @pytest.mark.parametrize("field", Diffusion._fields)
-    @pytest.mark.parametrize("value", [np.zeros((1, 1)), np.zeros((9, 9)), None, np.full((2, 2), np.inf, dtype="f4")])
-    def test_noise_of_one_s_own(self, field, value):
-        class Own(Noise):
-            def bind(self, actuation, joints):
-                fields = Diffusion(np.zeros((2, 2)), np.zeros((2, 2, 2)), np.zeros((2, 2)), np.zeros((2, 2)))
-                return BoundNoise(fields._replace(**{field: value}))
+# What has to be refused, and what the message names.
+REFUSED = [
+    *((name, value, facts) for name in ("q0", "v0") for value, facts in (
+        ([0.0, np.nan], ("[1]", "nan")), ([np.inf, 0.0], ("[0]", "inf")), ([0.0], ("(2,)", "(1,)")),
+        (0.0, ("(2,)", "()")), ("text", "real numbers"))),
+    *(("dt", value, str(value)) for value in (0, -0.01, np.nan, np.inf, True)),
+    *((name, None, ("dt", "steps", "duration", "tolerance")) for name in ("dt", "steps")),
+    *(("steps", value, repr(value)) for value in (-1, 2.5, "5")),
+    ("steps", 10**15, ("1000000000000000", "memory")),
+    *(("controls", np.zeros(shape), ("(5, 2)", "(2,)", str(shape))) for shape in ((4, 2), (5, 3), (3,), ())),
+    ("controls", np.array([[0, 0]] * 4 + [[0, np.nan]]), ("controls[4, 1]", "nan")),
+    ("controls", lambda t: [0.0, 0.0], ("(t, q, v)", "varpin.OpenLoop(f)")),
+    ("integrator", vp.Midpoint, "varpin.Midpoint()"),
+    ("period", 0, "0"),
+    ("period", 2, "period = 2"),
+]  # fmt: skip
 
-        with pytest.raises((vp.InputError, AttributeError)) as info:
-            vp.Scene(ROBOT, noise=Own())
-        # Without the first array not even the number of processes is there.
-        assert info.type is vp.InputError or (field == "constant" and value is None)
 
-    @pytest.mark.parametrize("part", [1.0, "JointDamper", Element("JointDamper", 0, (np.nan,))])
-    def test_forces_of_one_s_own(self, part):
-        class Own(Force):
-            def bind(self, robot):
-                return (part,)
+@pytest.mark.parametrize(("name", "value", "facts"), REFUSED)
+def test_arguments_of_a_motion(name, value, facts):
+    with refused(vp.InputError, name, facts):
+        motion(**{name: value})
 
-        with refused(vp.InputError, "Own.bind", repr(part)):
-            vp.Scene(ROBOT, forces=Own())
 
-    @pytest.mark.parametrize(
-        ("gradient", "hessian"), [((5, 6), (2, 6, 6)), ((5, 6), (6, 6)), ((5, 1), (1, 6, 6)), ((1, 6), (5, 6, 6))]
-    )
-    def test_costs_of_one_s_own(self, gradient, hessian):
-        class Bound(BoundCost):
-            def value(self, q, v, u):
-                return np.zeros(q.shape[:-1])
+@pytest.mark.parametrize("controls", [[0.1, 0.2], vp.OpenLoop(lambda t: [0.1, 0.2])])
+def test_a_period_is_of_a_law(controls):
+    with refused(vp.InputError, "period = 2"):
+        motion(controls=controls, period=2)
 
-            def expand(self, q, v, u):
-                return Expansion(np.zeros(gradient), np.zeros(hessian))
 
-        class Own(Cost):
-            def bind(self, points):
-                return Bound()
+@pytest.mark.parametrize("kind", ["law", "open loop"])
+@pytest.mark.parametrize(
+    ("value", "facts"),
+    [
+        (lambda: [1.0], ("(2,)", "(1,)")),
+        (lambda: [0.0, np.nan], ("[1]", "nan")),
+        (lambda: None, "None"),
+        (lambda: 0.0, ("(2,)", "()")),
+        (lambda: 1 / 0, "ZeroDivisionError('division by zero')"),
+    ],
+)
+def test_control_functions(kind, value, facts):
+    def swing(t):
+        return [0.1, 0.2] if t < 3e-3 else value()
 
-        problem = vp.OptimalControlProblem(SCENE, Own() + vp.ControlCost(1.0), [0, 0], [0, 0], dt=1e-3, steps=5)
-        with refused(vp.CostError, "shapes"):
-            vp.solve(problem)
+    controls, source = (lambda t, q, v: swing(t)), "controls(t, q, v)"
+    if kind == "open loop":
+        controls, source = vp.OpenLoop(swing), "OpenLoop: f(t)"
+    with refused(vp.ControlError, "step 3", "t = ", source, facts, "error.trajectory") as info:
+        motion(controls=controls, integrator=vp.Midpoint())
+    error, whole = info.value, motion(steps=3, controls=[0.1, 0.2], integrator=vp.Midpoint())
+    assert (error.step, error.trajectory.steps) == (3, 3)
+    assert 3e-3 - 1e-12 <= error.time < 4e-3
+    np.testing.assert_allclose(error.trajectory.q, whole.q, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(error.trajectory.u, whole.u, rtol=1e-14)
+    assert isinstance(error.__cause__, ZeroDivisionError) == ("ZeroDivisionError" in facts)
 
-    @pytest.mark.parametrize(
-        ("name", "value"),
-        [
-            ("q", np.zeros((5, 2))),
-            ("q", np.zeros((6, 3))),
-            ("u", np.zeros((3, 2))),
-            ("t", np.zeros(0)),
-            ("constraint_forces", np.zeros((5, 1))),
-            ("u_stages", np.zeros((5, 2, 1))),
-            ("u_nodes", np.zeros((6, 3))),
-            ("error", np.zeros((5, 2))),
-        ],
-    )
-    def test_trajectories_changed_by_hand(self, name, value):
-        motion = vp.simulate(SCENE, [0.1, 0.2], [0.0, 0.0], dt=1e-3, steps=5)
-        with pytest.raises(ValueError, match="must be a float64 array"):
-            vp.linearize(SCENE, dataclasses.replace(motion, **{name: value}))
+
+@pytest.mark.parametrize(
+    ("function", "facts"),
+    [
+        (lambda t, q, v: [0.0, 0.0], ("(t, q, v)", "controls=law")),
+        (lambda: [0.0, 0.0], ("OpenLoop", "time")),
+        ([0.0, 0.0], ("OpenLoop", "[0.0, 0.0]")),
+    ],
+)
+def test_open_loops_of_something_else(function, facts):
+    with refused(vp.InputError, facts):
+        vp.OpenLoop(function)
+
+
+def test_an_ensemble_takes_no_law():
+    with refused(vp.InputError, "simulate"):
+        ensemble(controls=lambda t, q, v: [0.0, 0.0])
+    with refused(vp.ControlError, "step 1", "OpenLoop", "(2,)") as info:
+        ensemble(controls=vp.OpenLoop(lambda t: [0.0, 0.0] if t < 1e-3 else [0.0]))
+    assert info.value.trajectory is None
+
+
+@pytest.mark.parametrize("field", Diffusion._fields)
+@pytest.mark.parametrize("value", [np.zeros((1, 1)), np.zeros((9, 9)), None, np.full((2, 2), np.inf, dtype="f4")])
+def test_noise_of_one_s_own(field, value):
+    class Own(Noise):
+        def bind(self, actuation, joints):
+            fields = Diffusion(np.zeros((2, 2)), np.zeros((2, 2, 2)), np.zeros((2, 2)), np.zeros((2, 2)))
+            return BoundNoise(fields._replace(**{field: value}))
+
+    # Without the first array not even the number of processes is there.
+    unknown = field == "constant" and value is None
+    with pytest.raises((vp.InputError, AttributeError) if unknown else vp.InputError):
+        vp.Scene(ROBOT, noise=Own())
+
+
+@pytest.mark.parametrize("part", [1.0, "JointDamper", Element("JointDamper", 0, (np.nan,))])
+def test_forces_of_one_s_own(part):
+    class Own(Force):
+        def bind(self, robot):
+            return (part,)
+
+    with refused(vp.InputError, "Own.bind", repr(part)):
+        vp.Scene(ROBOT, forces=Own())
+
+
+@pytest.mark.parametrize(
+    ("gradient", "hessian"), [((5, 6), (2, 6, 6)), ((5, 6), (6, 6)), ((5, 1), (1, 6, 6)), ((1, 6), (5, 6, 6))]
+)
+def test_costs_of_one_s_own(gradient, hessian):
+    class Bound(BoundCost):
+        def value(self, q, v, u):
+            return np.zeros(q.shape[:-1])
+
+        def expand(self, q, v, u):
+            return Expansion(np.zeros(gradient), np.zeros(hessian))
+
+    class Own(Cost):
+        def bind(self, points):
+            return Bound()
+
+    problem = vp.OptimalControlProblem(SCENE, Own() + vp.ControlCost(1.0), [0, 0], [0, 0], dt=1e-3, steps=5)
+    with refused(vp.CostError, "shapes"):
+        vp.solve(problem)
+
+
+CHANGED = {"q": [(5, 2), (6, 3)], "u": [(3, 2)], "t": [(0,)], "constraint_forces": [(5, 1)]}
+CHANGED |= {"u_stages": [(5, 2, 1)], "u_nodes": [(6, 3)], "error": [(5, 2)]}
+
+
+@pytest.mark.parametrize(("name", "shape"), [(name, shape) for name, own in CHANGED.items() for shape in own])
+def test_trajectories_changed_by_hand(name, shape):
+    with pytest.raises(ValueError, match="must be a float64 array"):
+        vp.linearize(SCENE, dataclasses.replace(motion(), **{name: np.zeros(shape)}))
