@@ -23,7 +23,11 @@ from varpin.mechanics.noise import BoundNoise, Noise
 
 ROBOT = vp.planar_chain(2)
 SCENE, NOISY = vp.Scene(ROBOT), vp.Scene(ROBOT, noise=vp.AdditiveNoise(1e-3))
-CLEAR = {"obstacles": [vp.Obstacle.sphere([2, 0, 0], 0.1)], "capsules": {"tip": ([0, 0, 0], [0, 0, -1.0], 0.05)}}
+CLEAR = {
+    "robot": ROBOT,
+    "obstacles": [vp.Obstacle.sphere([2, 0, 0], 0.1)],
+    "capsules": {"tip": ([0, 0, 0], [0, 0, -1.0], 0.05)},
+}
 FINER = {"increments": [[0.1], [0.2]], "dt": 0.1, "rng": 0}
 
 extremes = [0.0, -0.0, 1.0, -1.0, 1e-320, 1e-160, 1e160, -1e160, 1e308, np.inf, np.nan]
@@ -57,9 +61,9 @@ def motion(scene=SCENE, q0=(0.1, 0.2), v0=(0.3, 0.4), **changes):
     return vp.simulate(scene, q0, v0, **({"dt": 1e-3, "steps": 5} | changes))
 
 
-def ensemble(q0=(0.1, 0.2), v0=(0.3, 0.4), **changes):
-    options = {"dt": 1e-3, "steps": 5, "paths": 3, "rng": 0, "workers": 1} | changes
-    return vp.simulate_ensemble(NOISY, q0, v0, **options)
+def ensemble(**changes):
+    options = {"q0": [0.1, 0.2], "v0": [0.3, 0.4], "dt": 1e-3, "steps": 5, "paths": 3, "rng": 0, "workers": 1}
+    return vp.simulate_ensemble(NOISY, **options | changes)
 
 
 def of_scene(robot=ROBOT, **changes):
@@ -78,60 +82,51 @@ def plan(t0=0.0, q0=(0.0, 0.0), v0=(0.0, 0.0), **options):
     return vp.solve(problem, **solving).trajectory
 
 
-def jet(q=(0.0, 0.0), v=(0.0, 0.0), backend="compiled"):
-    return vp.lagrangian_jet(SCENE, q, v, backend=backend).Lvv
+def within(function, **usual):
+    """The function, of which some arguments have usual values."""
+    return lambda **given: function(**usual | given)
 
 
-def discrete(q0=(0.0, 0.0), q1=(0.0, 0.0), dt=0.1, alpha=0.5):
-    return vp.discrete_lagrangian(SCENE, q0, q1, dt, alpha=alpha)
+def integrated(kind):
+    return lambda **given: motion(integrator=kind(**given))
 
 
-def guarded(**changes):
-    return motion(integrator=vp.Gauss(2, guard=vp.Guard(**changes)))
+def noisy(kind):
+    return lambda **given: of_scene(noise=kind(**given))
 
 
-def noise_of(kind):
-    return lambda intensity: of_scene(noise=kind(intensity))
-
+START = {"scene": SCENE, "q": [0.0, 0.0], "v": [0.0, 0.0]}
+DISCRETE = {"scene": SCENE, "q0": [0.0, 0.0], "q1": [0.0, 0.0], "dt": 0.1}
 
 # Each argument of a function is given anything; the others keep their defaults.
 FUNCTIONS = {
-    "robot": (lambda links=2, **given: vp.planar_chain(links, **given), ("links", "length", "mass")),
-    "load_robot": (lambda **given: vp.load_robot("ur5", **given), ("package_dirs", "mimic", "lock")),
-    "Scene": (
-        of_scene,
-        ("robot", "gravity", "damping", "stiffness", "rest", "friction", "actuation", "noise", "forces"),
+    "robot": (within(vp.planar_chain, links=2), "links length mass"),
+    "load_robot": (within(vp.load_robot, source="ur5"), "package_dirs mimic lock"),
+    "Scene": (of_scene, "robot gravity damping stiffness rest friction actuation noise forces"),
+    "simulate": (motion, "scene q0 v0 dt steps controls increments rng integrator period check"),
+    "simulate_ensemble": (ensemble, "q0 v0 dt steps paths rng controls quantiles store progress integrator"),
+    "policy": (fed, "u gains reference hold on limits before period previous_gains integrator"),
+    "OpenLoop": (lambda **given: motion(controls=vp.OpenLoop(**given)), "f"),
+    "Midpoint": (integrated(vp.Midpoint), "alpha guard tolerance kick"),
+    "Gauss": (integrated(vp.Gauss), "stages"),
+    "Reference": (integrated(vp.Reference), "rtol atol"),
+    "Guard": (
+        lambda **given: motion(integrator=vp.Gauss(2, guard=vp.Guard(**given))),
+        "branch_margin energy_balance energy_budget max_halvings",
     ),
-    "simulate": (
-        motion,
-        ("scene", "q0", "v0", "dt", "steps", "controls", "increments", "rng", "integrator", "period", "check"),
-    ),
-    "simulate_ensemble": (
-        ensemble,
-        ("q0", "v0", "dt", "steps", "paths", "rng", "controls", "quantiles", "store", "progress", "integrator"),
-    ),
-    "policy": (
-        fed,
-        ("u", "gains", "reference", "hold", "on", "limits", "before", "period", "previous_gains", "integrator"),
-    ),
-    "OpenLoop": (lambda **given: motion(controls=vp.OpenLoop(**given)), ("f",)),
-    "Midpoint": (lambda **given: motion(integrator=vp.Midpoint(**given)), ("alpha", "guard", "tolerance", "kick")),
-    "Gauss": (lambda **given: motion(integrator=vp.Gauss(**given)), ("stages",)),
-    "Reference": (lambda **given: motion(integrator=vp.Reference(**given)), ("rtol", "atol")),
-    "Guard": (guarded, ("branch_margin", "energy_balance", "energy_budget", "max_halvings")),
-    "solve": (plan, ("t0", "q0", "v0", "check", "second_order", "time_limit", "integrator")),
-    "lagrangian_jet": (jet, ("q", "v", "backend")),
-    "v": (discrete, ("q0", "q1", "dt", "alpha")),
-    "configuration": (ROBOT.configuration, ("q",)),
-    "propagate_moments": (vp.propagate_moments, ("linearization",)),
-    "refine": (lambda **given: vp.wiener.refine(**(FINER | given)), ("increments", "dt", "rng")),
-    "wiener_increments": (lambda dt: vp.wiener.wiener_increments(1, dt, 3, rng=0), ("dt",)),
-    "KeepClear": (lambda **given: vp.KeepClear(ROBOT, **(CLEAR | given)), ("obstacles", "capsules", "itself")),
-    "link": (lambda links: vp.KeepClear(ROBOT, **CLEAR, links=links), ("links",)),
-    "AdditiveNoise": (noise_of(vp.AdditiveNoise), ("intensity",)),
-    "ControlNoise": (noise_of(vp.ControlNoise), ("intensity",)),
-    "StateNoise": (noise_of(vp.StateNoise), ("intensity",)),
-    "center": (lambda center: of_scene(noise=vp.StateNoise(1.0, center)), ("center",)),
+    "solve": (plan, "t0 q0 v0 check second_order time_limit integrator"),
+    "lagrangian_jet": (within(vp.lagrangian_jet, **START), "q v backend"),
+    "v": (within(vp.discrete_lagrangian, **DISCRETE), "q0 q1 dt alpha"),
+    "configuration": (ROBOT.configuration, "q"),
+    "propagate_moments": (vp.propagate_moments, "linearization"),
+    "refine": (within(vp.wiener.refine, **FINER), "increments dt rng"),
+    "wiener_increments": (lambda dt: vp.wiener.wiener_increments(1, dt, 3, rng=0), "dt"),
+    "KeepClear": (within(vp.KeepClear, **CLEAR), "obstacles capsules itself"),
+    "link": (within(vp.KeepClear, **CLEAR), "links"),
+    "AdditiveNoise": (noisy(vp.AdditiveNoise), "intensity"),
+    "ControlNoise": (noisy(vp.ControlNoise), "intensity"),
+    "StateNoise": (noisy(vp.StateNoise), "intensity"),
+    "center": (noisy(within(vp.StateNoise, intensity=1.0)), "center"),
 }
 
 
@@ -143,7 +138,7 @@ def require_finite(found) -> None:
 
 
 @pytest.mark.parametrize(
-    ("function", "argument"), [(name, argument) for name, (_, own) in FUNCTIONS.items() for argument in own]
+    ("function", "argument"), [(name, argument) for name, (_, own) in FUNCTIONS.items() for argument in own.split()]
 )
 @SETTINGS
 @given(value=anything)

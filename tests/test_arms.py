@@ -15,8 +15,8 @@ RUBBING = ["xarm7", "z1", "talos_arm", "allegro_left_hand"]
 DAMPED = ["allegro_right_hand", "tiago_no_hand", "tiago_pro", "panda", "panda_collision", "baxter"]
 DAMPED += ["double_pendulum", "double_pendulum_continuous", "double_pendulum_simple"]
 DAMPED += ["alex_sake_hands", "alex_nub_hands", "alex_psyonic_hands"]
-EVERY = [(name, share, False, 20) for name in RUBBING + DAMPED for share in (0.05, 0.2)]
-EVERY += [(name, share, True, 20) for name in RUBBING for share in (0.05, 0.2)]
+EVERY = [(name, share, False, 10) for name in RUBBING + DAMPED for share in (0.05, 0.2)]
+EVERY += [(name, share, True, 10) for name in RUBBING for share in (0.05, 0.2)]
 
 
 @pytest.mark.parametrize(

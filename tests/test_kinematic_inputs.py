@@ -112,17 +112,6 @@ def test_a_controller_moves_a_joint_by_hand(interpolation):
         vp.Mpc(problem).run(vp.Plant(vp.Scene(heavy, **other)), duration=0.1)
 
 
-def test_noise_does_not_move_what_is_moved_by_hand():
-    scene, q, v = cranked(noise=vp.AdditiveNoise(0.3)), FIVE.q0, FIVE.v0
-    path = q[0] + v[0] * np.linspace(0.0, 0.2, 21)
-    controls = path[1:, None] * np.eye(4)[0]
-    paths = vp.simulate_ensemble(scene, q, v, dt=0.01, steps=20, paths=5, rng=0, controls=controls)
-    np.testing.assert_allclose(paths.q[:, :, 0], np.broadcast_to(path, (5, 21)), atol=1e-12)
-    assert np.ptp(paths.q[:, -1, 1]) > 1e-4
-    still = vp.simulate(scene, q, np.zeros(4), dt=0.01, steps=3, increments=0.0)
-    np.testing.assert_allclose(still.q[:, 0], q[0], atol=1e-14)
-
-
 @over_interpolations
 def test_noise_of_the_other_controls(interpolation):
     """The hand moves as told, the motor's noise is as in a scene whose hand has no control, and a plan knows it."""

@@ -19,8 +19,8 @@ from varpin.model.meshes import read_mesh
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 
 
-def mesh(name):
-    return f'<visual><geometry><mesh filename="{name}"/></geometry></visual>'
+def mesh(name, scale="1 1 1"):
+    return f'<visual><geometry><mesh filename="{name}" scale="{scale}"/></geometry></visual>'
 
 
 @pytest.fixture
@@ -34,8 +34,8 @@ def package(tmp_path):
     return folder
 
 
-def two_links(folder, first, second=""):
-    parts = [link("l1", INERTIAL, first), link("l2", INERTIAL, second)]
+def two_links(folder, first="", second="", inertial=INERTIAL):
+    parts = [link("l1", INERTIAL, first), link("l2", inertial, second)]
     return write_urdf(folder, *parts, joint("j1", "base", "l1"), joint("j2", "l1", "l2"))
 
 
@@ -210,9 +210,9 @@ def volume(triangles):
     return np.linalg.det(triangles).sum() / 6.0
 
 
-def arm(folder, name, scale):
-    shape = f'<visual><geometry><mesh filename="{name}" scale="{scale}"/></geometry></visual>'
-    return write_urdf(folder, link("l1"), link("l2", "", shape), joint("j1", "base", "l1"), joint("j2", "l1", "l2"))
+def arm(folder, name, scale="1 1 1"):
+    """Its second link has a mesh and no inertia."""
+    return two_links(folder, "", mesh(name, scale), "")
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -290,11 +290,11 @@ def test_what_is_no_mesh_is_named_with_its_cause(tmp_path, name, content, facts)
     with refused(vp.FileError, facts):
         vp.Obstacle.mesh(tmp_path / name)
     with refused(vp.RobotError, ("'l2'", *facts)):
-        geometry(vp.load_robot(arm(tmp_path, name, "1 1 1"), lock={"j2": 0.0}))
+        geometry(vp.load_robot(arm(tmp_path, name), lock={"j2": 0.0}))
 
 
-def test_meshes_without_a_volume_are_named(tmp_path):
-    path = arm(tmp_path, "a.obj", "1 1 1")
+def test_meshes_without_a_volume_and_scales_that_are_none_are_named(tmp_path):
+    path = arm(tmp_path, "a.obj")
     for faces in (QUADS[:, ::-1], QUADS[:5]):
         (tmp_path / "a.obj").write_text(wavefront(faces=faces))
         with refused(vp.RobotError, "'l2'", "a.obj", "no volume"):
@@ -302,22 +302,15 @@ def test_meshes_without_a_volume_are_named(tmp_path):
     (tmp_path / "a.obj").unlink()
     with refused(vp.RobotError, "'l2'", "a.obj", "package_dirs"):
         vp.load_robot(path, inertia="meshes")
-
-
-@pytest.mark.parametrize("scale", ["1 1", "1 0 1", "one 1 1", "inf 1 1"])
-def test_scales_are_three_numbers(tmp_path, scale):
     (tmp_path / "a.obj").write_text(wavefront())
-    with refused(vp.RobotError, "'l2'", "a.obj", repr(scale)):
-        vp.load_robot(arm(tmp_path, "a.obj", scale), inertia="meshes")
+    for scale in ("1 1", "1 0 1", "one 1 1", "inf 1 1"):
+        with refused(vp.RobotError, "'l2'", "a.obj", repr(scale)):
+            vp.load_robot(arm(tmp_path, "a.obj", scale), inertia="meshes")
 
 
-@pytest.mark.parametrize(
-    ("scale", "told"), [("1 1 1", False), ("1000 1000 1000", True), ("39.4 39.4 39.4", True), ("1e-3 1e-3 1e-3", True)]
-)
-def test_a_mesh_in_other_units_is_told(tmp_path, scale, told):
+@pytest.mark.parametrize("scale", ["1 1 1", "1000 1000 1000", "39.4 39.4 39.4", "1e-3 1e-3 1e-3"])
+def test_a_mesh_in_other_units_is_told(tmp_path, scale):
     (tmp_path / "a.stl").write_bytes(binary_stl())
-    shape = f'<visual><geometry><mesh filename="a.stl" scale="{scale}"/></geometry></visual>'
-    path = write_urdf(tmp_path, link("l1", extra=shape), link("l2"), joint("j1", "base", "l1"), joint("j2", "l1", "l2"))
-    warnings = vp.inspect_robot(path).warnings
-    assert bool(naming(warnings, "mesh 'a.stl'", "'l1'", "scale=")) == told
+    warnings = vp.inspect_robot(two_links(tmp_path, mesh("a.stl", scale))).warnings
+    assert bool(naming(warnings, "mesh 'a.stl'", "'l1'", "scale=")) == (scale != "1 1 1")
     assert all(len(warning) <= 240 for warning in warnings)

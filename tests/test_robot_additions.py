@@ -148,39 +148,23 @@ def test_the_description_s_dampers_take_what_pinocchio_s_model_says(rubbing, cap
     np.testing.assert_array_equal(*ends)
 
 
-def written(folder, head="", base=""):
+def loaded(folder, damping, base):
     path = folder / "scene.toml"
-    path.write_text(f'{head}\n[robot]\nsource = "xarm7"\n{base}\n[horizon]\ndt = 1e-3\nsteps = 3\n')
-    return path
+    robot = f'[robot]\nsource = "xarm7"\nbase = {base}\narmature = {{ joint3 = 0.4 }}'
+    path.write_text(f"damping = {damping}\n{robot}\n[horizon]\ndt = 1e-3\nsteps = 3\n")
+    return vp.load_scene(path, required_only=False).scene
 
 
-def test_scene_files_take_additions(tmp_path):
-    assert vp.load_scene(written(tmp_path, base='base = "planar"')).robot.joint_names[:3] == (
-        "base_x",
-        "base_y",
-        "base_turn",
-    )
-    base = "base = { xyz = [0.0, 0.0, 2.0], rpy = [0.0, 0.5, 0.3] }\narmature = { joint3 = 0.4 }"
-    robot = vp.load_scene(written(tmp_path, base=base)).robot
+def test_scene_files_take_them(tmp_path):
+    scene = loaded(tmp_path, '"robot"', '"planar"')
+    assert scene.robot.joint_names[:3] == ("base_x", "base_y", "base_turn")
+    assert scene.damping.tolist() == [0.0] * 3 + [10.0, 10.0, 5.0, 5.0, 5.0, 2.0, 2.0]
+    robot = loaded(tmp_path, "0.0", "{ xyz = [0.0, 0.0, 2.0], rpy = [0.0, 0.5, 0.3] }").robot
+    assert robot.tree.armature[robot.joint_names.index("joint3")] == 0.4
     place = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.5, 0.3), np.array([0.0, 0.0, 2.0]))
     other, q = vp.load_robot("xarm7", base=place), np.zeros(7)
     np.testing.assert_allclose(robot.frame_positions(q), other.frame_positions(q), atol=1e-12)
-    assert robot.tree.armature[robot.joint_names.index("joint3")] == 0.4
     with refused(vp.SceneFileError, "robot.base"):
-        vp.load_scene(written(tmp_path, base='base = "round"'))
-
-
-def test_scene_files_take_dampers(tmp_path, caplog):
-    own = vp.load_robot("xarm7").damping.tolist()
-    assert own == [10.0, 10.0, 5.0, 5.0, 5.0, 2.0, 2.0]
-    # The robot's file gives dry friction, too, which is told of wherever the rest is taken.
-    for head, damping, told in (
-        ("", [0.0] * 7, 2),
-        ('damping = "robot"', own, 1),
-        ("damping = 0.0", [0.0] * 7, 0),
-    ):
-        caplog.clear()
-        scene = vp.load_scene(written(tmp_path, head), required_only=False).scene
-        assert (scene.damping.tolist(), len(left_out(caplog))) == (damping, told)
+        loaded(tmp_path, "0.0", '"round"')
     with refused(vp.SceneFileError, "'urdf'", "robot"):
-        vp.load_scene(written(tmp_path, 'damping = "urdf"'))
+        loaded(tmp_path, '"urdf"', '"planar"')

