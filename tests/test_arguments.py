@@ -195,10 +195,20 @@ def test_arguments_of_a_motion(name, value, facts):
         motion(**{name: value})
 
 
-@pytest.mark.parametrize("controls", [[0.1, 0.2], vp.OpenLoop(lambda t: [0.1, 0.2])])
-def test_a_period_is_of_a_law(controls):
-    with refused(vp.InputError, "period = 2"):
-        motion(controls=controls, period=2)
+@pytest.mark.parametrize(
+    ("call", "facts"),
+    [
+        (lambda: vp.OpenLoop(lambda t, q, v: [0.0, 0.0]), ("(t, q, v)", "controls=law")),
+        (lambda: vp.OpenLoop(lambda: [0.0, 0.0]), ("OpenLoop", "time")),
+        (lambda: vp.OpenLoop([0.0, 0.0]), ("OpenLoop", "[0.0, 0.0]")),
+        (lambda: motion(controls=[0.1, 0.2], period=2), "period = 2"),
+        (lambda: motion(controls=vp.OpenLoop(lambda t: [0.1, 0.2]), period=2), "period = 2"),
+        (lambda: ensemble(controls=lambda t, q, v: [0.0, 0.0]), "simulate"),
+    ],
+)
+def test_controls_that_do_not_fit(call, facts):
+    with refused(vp.InputError, facts):
+        call()
 
 
 @pytest.mark.parametrize("kind", ["law", "open loop"])
@@ -229,22 +239,7 @@ def test_control_functions(kind, value, facts):
     assert isinstance(error.__cause__, ZeroDivisionError) == ("ZeroDivisionError" in facts)
 
 
-@pytest.mark.parametrize(
-    ("function", "facts"),
-    [
-        (lambda t, q, v: [0.0, 0.0], ("(t, q, v)", "controls=law")),
-        (lambda: [0.0, 0.0], ("OpenLoop", "time")),
-        ([0.0, 0.0], ("OpenLoop", "[0.0, 0.0]")),
-    ],
-)
-def test_open_loops_of_something_else(function, facts):
-    with refused(vp.InputError, facts):
-        vp.OpenLoop(function)
-
-
-def test_an_ensemble_takes_no_law():
-    with refused(vp.InputError, "simulate"):
-        ensemble(controls=lambda t, q, v: [0.0, 0.0])
+def test_a_broken_open_loop_ends_an_ensemble():
     with refused(vp.ControlError, "step 1", "OpenLoop", "(2,)") as info:
         ensemble(controls=vp.OpenLoop(lambda t: [0.0, 0.0] if t < 1e-3 else [0.0]))
     assert info.value.trajectory is None

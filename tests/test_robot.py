@@ -189,6 +189,9 @@ class TestLocking:
             q[whole.coordinate(joint_name)], v[whole.coordinate(joint_name)] = position, 0.0
         locked, unlocked = jet_at(robot, q[keep], v[keep]), jet_at(whole, q, v)
         assert_same_jet(locked, unlocked, keep)
+        for frame in list(robot.model.frames)[1:]:
+            (mine,), (its,) = placements(robot, q[None, keep], frame.name), placements(whole, q[None], frame.name)
+            np.testing.assert_allclose(mine.homogeneous, its.homogeneous, rtol=0, atol=1e-13, err_msg=frame.name)
         elsewhere = q.copy()
         elsewhere[keep] = rng.uniform(-1.0, 1.0, len(keep))
         # What hangs on the world for good adds a constant to the potential energy.

@@ -17,6 +17,7 @@ from varpin.model import geometry
 
 HEAD = '<?xml version="1.0"?>\n<robot name="made_up" xmlns:xacro="http://www.ros.org/wiki/xacro">\n'
 BALL = '<visual><geometry><mesh filename="package://parts/ball.obj"/></geometry></visual>'
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 
 # A macro in a package beside it, one found by a relative path, an argument, a property and a condition.
 ARM = f"""{HEAD}<xacro:arg name="prefix" default=""/>
@@ -40,7 +41,7 @@ def workspace(tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / "package.xml").write_text(f"<package><name>{name}</name></package>")
     (tmp_path / "parts" / "macros.xacro").write_text(MACROS)
-    (tmp_path / "parts" / "ball.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (tmp_path / "parts" / "ball.obj").write_text(TRIANGLE)
     (tmp_path / "my_arm" / "base.xacro").write_text(HEAD + '<link name="base"/></robot>')
     path = tmp_path / "my_arm" / "arm.urdf.xacro"
     path.write_text(ARM)
@@ -132,8 +133,8 @@ def test_a_robot_of_robot_descriptions(tmp_path, described):
     """With the posture of its SRDF, and a mesh in a package of its repository."""
     folder = tmp_path / "cache" / "repository" / "parts"
     folder.mkdir(parents=True)
-    (folder / "ball.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    urdf, srdf = arm(folder), tmp_path / "any.srdf"
+    (folder / "ball.obj").write_text(TRIANGLE)
+    urdf, srdf = arm(tmp_path), tmp_path / "any.srdf"
     urdf.write_text(urdf.read_text().replace("</link>", f"{BALL}</link>"))
     srdf.write_text('<robot name="a"><group_state name="home"><joint name="j1" value="0.5"/></group_state></robot>')
     described(URDF_PATH=urdf, SRDF_PATH=srdf, REPOSITORY_PATH=folder.parent)
