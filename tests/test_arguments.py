@@ -23,7 +23,11 @@ from varpin.mechanics.noise import BoundNoise, Noise
 
 ROBOT = vp.planar_chain(2)
 SCENE, NOISY = vp.Scene(ROBOT), vp.Scene(ROBOT, noise=vp.AdditiveNoise(1e-3))
-CLEAR = {"obstacles": [vp.Obstacle.sphere([2, 0, 0], 0.1)], "capsules": {"tip": ([0, 0, 0], [0, 0, -1.0], 0.05)}}
+CLEAR = {
+    "robot": ROBOT,
+    "obstacles": [vp.Obstacle.sphere([2, 0, 0], 0.1)],
+    "capsules": {"tip": ([0, 0, 0], [0, 0, -1.0], 0.05)},
+}
 FINER = {"increments": [[0.1], [0.2]], "dt": 0.1, "rng": 0}
 
 extremes = [0.0, -0.0, 1.0, -1.0, 1e-320, 1e-160, 1e160, -1e160, 1e308, np.inf, np.nan]
@@ -57,9 +61,9 @@ def motion(scene=SCENE, q0=(0.1, 0.2), v0=(0.3, 0.4), **changes):
     return vp.simulate(scene, q0, v0, **({"dt": 1e-3, "steps": 5} | changes))
 
 
-def ensemble(q0=(0.1, 0.2), v0=(0.3, 0.4), **changes):
-    options = {"dt": 1e-3, "steps": 5, "paths": 3, "rng": 0, "workers": 1} | changes
-    return vp.simulate_ensemble(NOISY, q0, v0, **options)
+def ensemble(**changes):
+    options = {"q0": [0.1, 0.2], "v0": [0.3, 0.4], "dt": 1e-3, "steps": 5, "paths": 3, "rng": 0, "workers": 1}
+    return vp.simulate_ensemble(NOISY, **options | changes)
 
 
 def of_scene(robot=ROBOT, **changes):
@@ -78,60 +82,51 @@ def plan(t0=0.0, q0=(0.0, 0.0), v0=(0.0, 0.0), **options):
     return vp.solve(problem, **solving).trajectory
 
 
-def jet(q=(0.0, 0.0), v=(0.0, 0.0), backend="compiled"):
-    return vp.lagrangian_jet(SCENE, q, v, backend=backend).Lvv
+def within(function, **usual):
+    """The function, of which some arguments have usual values."""
+    return lambda **given: function(**usual | given)
 
 
-def discrete(q0=(0.0, 0.0), q1=(0.0, 0.0), dt=0.1, alpha=0.5):
-    return vp.discrete_lagrangian(SCENE, q0, q1, dt, alpha=alpha)
+def integrated(kind):
+    return lambda **given: motion(integrator=kind(**given))
 
 
-def guarded(**changes):
-    return motion(integrator=vp.Gauss(2, guard=vp.Guard(**changes)))
+def noisy(kind):
+    return lambda **given: of_scene(noise=kind(**given))
 
 
-def noise_of(kind):
-    return lambda intensity: of_scene(noise=kind(intensity))
-
+START = {"scene": SCENE, "q": [0.0, 0.0], "v": [0.0, 0.0]}
+DISCRETE = {"scene": SCENE, "q0": [0.0, 0.0], "q1": [0.0, 0.0], "dt": 0.1}
 
 # Each argument of a function is given anything; the others keep their defaults.
 FUNCTIONS = {
-    "robot": (lambda links=2, **given: vp.planar_chain(links, **given), ("links", "length", "mass")),
-    "load_robot": (lambda **given: vp.load_robot("ur5", **given), ("package_dirs", "mimic", "lock")),
-    "Scene": (
-        of_scene,
-        ("robot", "gravity", "damping", "stiffness", "rest", "friction", "actuation", "noise", "forces"),
+    "robot": (within(vp.planar_chain, links=2), "links length mass"),
+    "load_robot": (within(vp.load_robot, source="ur5"), "package_dirs mimic lock"),
+    "Scene": (of_scene, "robot gravity damping stiffness rest friction actuation noise forces"),
+    "simulate": (motion, "scene q0 v0 dt steps controls increments rng integrator period check"),
+    "simulate_ensemble": (ensemble, "q0 v0 dt steps paths rng controls quantiles store progress integrator"),
+    "policy": (fed, "u gains reference hold on limits before period previous_gains integrator"),
+    "OpenLoop": (lambda **given: motion(controls=vp.OpenLoop(**given)), "f"),
+    "Midpoint": (integrated(vp.Midpoint), "alpha guard tolerance kick"),
+    "Gauss": (integrated(vp.Gauss), "stages"),
+    "Reference": (integrated(vp.Reference), "rtol atol"),
+    "Guard": (
+        lambda **given: motion(integrator=vp.Gauss(2, guard=vp.Guard(**given))),
+        "branch_margin energy_balance energy_budget max_halvings",
     ),
-    "simulate": (
-        motion,
-        ("scene", "q0", "v0", "dt", "steps", "controls", "increments", "rng", "integrator", "period", "check"),
-    ),
-    "simulate_ensemble": (
-        ensemble,
-        ("q0", "v0", "dt", "steps", "paths", "rng", "controls", "quantiles", "store", "progress", "integrator"),
-    ),
-    "policy": (
-        fed,
-        ("u", "gains", "reference", "hold", "on", "limits", "before", "period", "previous_gains", "integrator"),
-    ),
-    "OpenLoop": (lambda **given: motion(controls=vp.OpenLoop(**given)), ("f",)),
-    "Midpoint": (lambda **given: motion(integrator=vp.Midpoint(**given)), ("alpha", "guard", "tolerance", "kick")),
-    "Gauss": (lambda **given: motion(integrator=vp.Gauss(**given)), ("stages",)),
-    "Reference": (lambda **given: motion(integrator=vp.Reference(**given)), ("rtol", "atol")),
-    "Guard": (guarded, ("branch_margin", "energy_balance", "energy_budget", "max_halvings")),
-    "solve": (plan, ("t0", "q0", "v0", "check", "second_order", "time_limit", "integrator")),
-    "lagrangian_jet": (jet, ("q", "v", "backend")),
-    "v": (discrete, ("q0", "q1", "dt", "alpha")),
-    "configuration": (ROBOT.configuration, ("q",)),
-    "propagate_moments": (vp.propagate_moments, ("linearization",)),
-    "refine": (lambda **given: vp.wiener.refine(**(FINER | given)), ("increments", "dt", "rng")),
-    "wiener_increments": (lambda dt: vp.wiener.wiener_increments(1, dt, 3, rng=0), ("dt",)),
-    "KeepClear": (lambda **given: vp.KeepClear(ROBOT, **(CLEAR | given)), ("obstacles", "capsules", "itself")),
-    "link": (lambda links: vp.KeepClear(ROBOT, **CLEAR, links=links), ("links",)),
-    "AdditiveNoise": (noise_of(vp.AdditiveNoise), ("intensity",)),
-    "ControlNoise": (noise_of(vp.ControlNoise), ("intensity",)),
-    "StateNoise": (noise_of(vp.StateNoise), ("intensity",)),
-    "center": (lambda center: of_scene(noise=vp.StateNoise(1.0, center)), ("center",)),
+    "solve": (plan, "t0 q0 v0 check second_order time_limit integrator"),
+    "lagrangian_jet": (within(vp.lagrangian_jet, **START), "q v backend"),
+    "v": (within(vp.discrete_lagrangian, **DISCRETE), "q0 q1 dt alpha"),
+    "configuration": (ROBOT.configuration, "q"),
+    "propagate_moments": (vp.propagate_moments, "linearization"),
+    "refine": (within(vp.wiener.refine, **FINER), "increments dt rng"),
+    "wiener_increments": (lambda dt: vp.wiener.wiener_increments(1, dt, 3, rng=0), "dt"),
+    "KeepClear": (within(vp.KeepClear, **CLEAR), "obstacles capsules itself"),
+    "link": (within(vp.KeepClear, **CLEAR), "links"),
+    "AdditiveNoise": (noisy(vp.AdditiveNoise), "intensity"),
+    "ControlNoise": (noisy(vp.ControlNoise), "intensity"),
+    "StateNoise": (noisy(vp.StateNoise), "intensity"),
+    "center": (noisy(within(vp.StateNoise, intensity=1.0)), "center"),
 }
 
 
@@ -143,7 +138,7 @@ def require_finite(found) -> None:
 
 
 @pytest.mark.parametrize(
-    ("function", "argument"), [(name, argument) for name, (_, own) in FUNCTIONS.items() for argument in own]
+    ("function", "argument"), [(name, argument) for name, (_, own) in FUNCTIONS.items() for argument in own.split()]
 )
 @SETTINGS
 @given(value=anything)
@@ -176,62 +171,129 @@ def test_numbers_of_any_size(state, dt, integrator):
         require_finite(vp.simulate(SCENE, *state, dt=dt, steps=3, integrator=integrator))
 
 
-class TestTheCoreGetsWhatFits:
-    @pytest.mark.parametrize("field", Diffusion._fields)
-    @pytest.mark.parametrize("value", [np.zeros((1, 1)), np.zeros((9, 9)), None, np.full((2, 2), np.inf, dtype="f4")])
-    def test_noise_of_one_s_own(self, field, value):
-        class Own(Noise):
-            def bind(self, actuation, joints):
-                fields = Diffusion(np.zeros((2, 2)), np.zeros((2, 2, 2)), np.zeros((2, 2)), np.zeros((2, 2)))
-                return BoundNoise(fields._replace(**{field: value}))
+# What has to be refused, and what the message names.
+REFUSED = [
+    *((name, value, facts) for name in ("q0", "v0") for value, facts in (
+        ([0.0, np.nan], ("[1]", "nan")), ([np.inf, 0.0], ("[0]", "inf")), ([0.0], ("(2,)", "(1,)")),
+        (0.0, ("(2,)", "()")), ("text", "real numbers"))),
+    *(("dt", value, str(value)) for value in (0, -0.01, np.nan, np.inf, True)),
+    *((name, None, ("dt", "steps", "duration", "tolerance")) for name in ("dt", "steps")),
+    *(("steps", value, repr(value)) for value in (-1, 2.5, "5")),
+    ("steps", 10**15, ("1000000000000000", "memory")),
+    *(("controls", np.zeros(shape), ("(5, 2)", "(2,)", str(shape))) for shape in ((4, 2), (5, 3), (3,), ())),
+    ("controls", np.array([[0, 0]] * 4 + [[0, np.nan]]), ("controls[4, 1]", "nan")),
+    ("controls", lambda t: [0.0, 0.0], ("(t, q, v)", "varpin.OpenLoop(f)")),
+    ("integrator", vp.Midpoint, "varpin.Midpoint()"),
+    ("period", 0, "0"),
+    ("period", 2, "period = 2"),
+]  # fmt: skip
 
-        with pytest.raises((vp.InputError, AttributeError)) as info:
-            vp.Scene(ROBOT, noise=Own())
-        # Without the first array not even the number of processes is there.
-        assert info.type is vp.InputError or (field == "constant" and value is None)
 
-    @pytest.mark.parametrize("part", [1.0, "JointDamper", Element("JointDamper", 0, (np.nan,))])
-    def test_forces_of_one_s_own(self, part):
-        class Own(Force):
-            def bind(self, robot):
-                return (part,)
+@pytest.mark.parametrize(("name", "value", "facts"), REFUSED)
+def test_arguments_of_a_motion(name, value, facts):
+    with refused(vp.InputError, name, facts):
+        motion(**{name: value})
 
-        with refused(vp.InputError, "Own.bind", repr(part)):
-            vp.Scene(ROBOT, forces=Own())
 
-    @pytest.mark.parametrize(
-        ("gradient", "hessian"), [((5, 6), (2, 6, 6)), ((5, 6), (6, 6)), ((5, 1), (1, 6, 6)), ((1, 6), (5, 6, 6))]
-    )
-    def test_costs_of_one_s_own(self, gradient, hessian):
-        class Bound(BoundCost):
-            def value(self, q, v, u):
-                return np.zeros(q.shape[:-1])
+@pytest.mark.parametrize(
+    ("call", "facts"),
+    [
+        (lambda: vp.OpenLoop(lambda t, q, v: [0.0, 0.0]), ("(t, q, v)", "controls=law")),
+        (lambda: vp.OpenLoop(lambda: [0.0, 0.0]), ("OpenLoop", "time")),
+        (lambda: vp.OpenLoop([0.0, 0.0]), ("OpenLoop", "[0.0, 0.0]")),
+        (lambda: motion(controls=[0.1, 0.2], period=2), "period = 2"),
+        (lambda: motion(controls=vp.OpenLoop(lambda t: [0.1, 0.2]), period=2), "period = 2"),
+        (lambda: ensemble(controls=lambda t, q, v: [0.0, 0.0]), "simulate"),
+    ],
+)
+def test_controls_that_do_not_fit(call, facts):
+    with refused(vp.InputError, facts):
+        call()
 
-            def expand(self, q, v, u):
-                return Expansion(np.zeros(gradient), np.zeros(hessian))
 
-        class Own(Cost):
-            def bind(self, points):
-                return Bound()
+@pytest.mark.parametrize("kind", ["law", "open loop"])
+@pytest.mark.parametrize(
+    ("value", "facts"),
+    [
+        (lambda: [1.0], ("(2,)", "(1,)")),
+        (lambda: [0.0, np.nan], ("[1]", "nan")),
+        (lambda: None, "None"),
+        (lambda: 0.0, ("(2,)", "()")),
+        (lambda: 1 / 0, "ZeroDivisionError('division by zero')"),
+    ],
+)
+def test_control_functions(kind, value, facts):
+    def swing(t):
+        return [0.1, 0.2] if t < 3e-3 else value()
 
-        problem = vp.OptimalControlProblem(SCENE, Own() + vp.ControlCost(1.0), [0, 0], [0, 0], dt=1e-3, steps=5)
-        with refused(vp.CostError, "shapes"):
-            vp.solve(problem)
+    controls, source = (lambda t, q, v: swing(t)), "controls(t, q, v)"
+    if kind == "open loop":
+        controls, source = vp.OpenLoop(swing), "OpenLoop: f(t)"
+    with refused(vp.ControlError, "step 3", "t = ", source, facts, "error.trajectory") as info:
+        motion(controls=controls, integrator=vp.Midpoint())
+    error, whole = info.value, motion(steps=3, controls=[0.1, 0.2], integrator=vp.Midpoint())
+    assert (error.step, error.trajectory.steps) == (3, 3)
+    assert 3e-3 - 1e-12 <= error.time < 4e-3
+    np.testing.assert_allclose(error.trajectory.q, whole.q, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(error.trajectory.u, whole.u, rtol=1e-14)
+    assert isinstance(error.__cause__, ZeroDivisionError) == ("ZeroDivisionError" in facts)
 
-    @pytest.mark.parametrize(
-        ("name", "value"),
-        [
-            ("q", np.zeros((5, 2))),
-            ("q", np.zeros((6, 3))),
-            ("u", np.zeros((3, 2))),
-            ("t", np.zeros(0)),
-            ("constraint_forces", np.zeros((5, 1))),
-            ("u_stages", np.zeros((5, 2, 1))),
-            ("u_nodes", np.zeros((6, 3))),
-            ("error", np.zeros((5, 2))),
-        ],
-    )
-    def test_trajectories_changed_by_hand(self, name, value):
-        motion = vp.simulate(SCENE, [0.1, 0.2], [0.0, 0.0], dt=1e-3, steps=5)
-        with pytest.raises(ValueError, match="must be a float64 array"):
-            vp.linearize(SCENE, dataclasses.replace(motion, **{name: value}))
+
+def test_a_broken_open_loop_ends_an_ensemble():
+    with refused(vp.ControlError, "step 1", "OpenLoop", "(2,)") as info:
+        ensemble(controls=vp.OpenLoop(lambda t: [0.0, 0.0] if t < 1e-3 else [0.0]))
+    assert info.value.trajectory is None
+
+
+@pytest.mark.parametrize("field", Diffusion._fields)
+@pytest.mark.parametrize("value", [np.zeros((1, 1)), np.zeros((9, 9)), None, np.full((2, 2), np.inf, dtype="f4")])
+def test_noise_of_one_s_own(field, value):
+    class Own(Noise):
+        def bind(self, actuation, joints):
+            fields = Diffusion(np.zeros((2, 2)), np.zeros((2, 2, 2)), np.zeros((2, 2)), np.zeros((2, 2)))
+            return BoundNoise(fields._replace(**{field: value}))
+
+    # Without the first array not even the number of processes is there.
+    unknown = field == "constant" and value is None
+    with pytest.raises((vp.InputError, AttributeError) if unknown else vp.InputError):
+        vp.Scene(ROBOT, noise=Own())
+
+
+@pytest.mark.parametrize("part", [1.0, "JointDamper", Element("JointDamper", 0, (np.nan,))])
+def test_forces_of_one_s_own(part):
+    class Own(Force):
+        def bind(self, robot):
+            return (part,)
+
+    with refused(vp.InputError, "Own.bind", repr(part)):
+        vp.Scene(ROBOT, forces=Own())
+
+
+@pytest.mark.parametrize(
+    ("gradient", "hessian"), [((5, 6), (2, 6, 6)), ((5, 6), (6, 6)), ((5, 1), (1, 6, 6)), ((1, 6), (5, 6, 6))]
+)
+def test_costs_of_one_s_own(gradient, hessian):
+    class Bound(BoundCost):
+        def value(self, q, v, u):
+            return np.zeros(q.shape[:-1])
+
+        def expand(self, q, v, u):
+            return Expansion(np.zeros(gradient), np.zeros(hessian))
+
+    class Own(Cost):
+        def bind(self, points):
+            return Bound()
+
+    problem = vp.OptimalControlProblem(SCENE, Own() + vp.ControlCost(1.0), [0, 0], [0, 0], dt=1e-3, steps=5)
+    with refused(vp.CostError, "shapes"):
+        vp.solve(problem)
+
+
+CHANGED = {"q": [(5, 2), (6, 3)], "u": [(3, 2)], "t": [(0,)], "constraint_forces": [(5, 1)]}
+CHANGED |= {"u_stages": [(5, 2, 1)], "u_nodes": [(6, 3)], "error": [(5, 2)]}
+
+
+@pytest.mark.parametrize(("name", "shape"), [(name, shape) for name, own in CHANGED.items() for shape in own])
+def test_trajectories_changed_by_hand(name, shape):
+    with pytest.raises(ValueError, match="must be a float64 array"):
+        vp.linearize(SCENE, dataclasses.replace(motion(), **{name: np.zeros(shape)}))

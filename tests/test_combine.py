@@ -1,14 +1,106 @@
-"""Several robots as one tree, against the robots by themselves and Pinocchio."""
+"""Several robots as one tree: each moves as by itself, and a step treats each by itself."""
 
 import numpy as np
 import pinocchio as pin
 import pytest
+from mechanisms import joint, link, mimic, random_tree, write_urdf
 from refusals import refused
 
 import varpin as vp
 from varpin.model import geometry, readable_geometry
 
 PLACE = pin.SE3(pin.utils.rotate("z", np.pi) @ pin.utils.rotate("x", 0.2), np.array([1.2, 0.1, 0.2]))
+INTEGRATORS = [vp.Midpoint(), vp.Midpoint(0.3), vp.Gauss(2), vp.SemiImplicitEuler(), vp.RungeKutta4()]
+over_integrators = pytest.mark.parametrize("integrator", INTEGRATORS, ids=str)
+STEPS = {"dt": 5e-3, "steps": 40}
+CHAINS = [vp.load_robot(random_tree(seed, size, branching=False)) for seed, size in ((3, 3), (1, 1), (4, 4))]
+PLACES = [None, PLACE, PLACE.inverse()]
+
+
+def forest():
+    """The chains beside each other, and the coordinates of each."""
+    together = vp.combine(*CHAINS, placements=PLACES, prefixes=["a_", "b_", "c_"])
+    return together, [np.arange(0, 3), np.arange(3, 4), np.arange(4, 8)]
+
+
+def between(parts):
+    """Which entries of a matrix (n, n) are of two parts."""
+    part = np.repeat(np.arange(len(parts)), [own.size for own in parts])
+    return part[:, None] != part
+
+
+@over_integrators
+def test_together_as_each_alone(integrator):
+    together, parts = forest()
+    assert together.tree.ends.tolist() == [3, 4, 8]
+    own_terms = {"damping": 0.05 + 0.01 * np.arange(8), "stiffness": 0.5 * np.arange(8), "rest": 0.1 * np.arange(8)}
+    noise, gravity = vp.AdditiveNoise(0.02), np.array([0.0, 1.0, -9.0])
+    scene = vp.Scene(together, gravity=gravity, noise=noise, **own_terms)
+    rng = np.random.default_rng(0)
+    q, v = rng.uniform(-1.0, 1.0, (2, 8))
+    dw = 0.03 * rng.normal(size=(40, 8))
+    # Feedback of every chain on every other: controls are constant over a step and couple no matrix of it.
+    law = vp.LinearPolicy(np.full((40, 8), 0.1), rng.normal(0.0, 0.1, (40, 8, 16)), np.zeros((40, 16)))
+    motion = vp.simulate(scene, q, v, controls=law, increments=dw, integrator=integrator, **STEPS)
+    assert np.abs(motion.u - 0.1).min() > 0.0
+    lin = vp.linearize(scene, motion)
+    curved = isinstance(integrator, vp.Midpoint | vp.Gauss)
+    z = rng.normal(size=16)
+    xx = vp.second_order(scene, motion, z).xx if curved else np.zeros((1, 16, 16))
+    for chain, place, own in zip(CHAINS, PLACES, parts, strict=True):
+        turned = gravity if place is None else place.rotation.T @ gravity
+        alone = vp.Scene(chain, gravity=turned, noise=noise, **{name: value[own] for name, value in own_terms.items()})
+        given = {"controls": motion.u[:, own], "increments": dw[:, own], "integrator": integrator, **STEPS}
+        moved = vp.simulate(alone, q[own], v[own], **given)
+        np.testing.assert_allclose(motion.q[:, own], moved.q, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(motion.p[:, own], moved.p, rtol=0, atol=1e-12)
+        both = np.concatenate([own, own + 8])
+        single = vp.linearize(alone, moved)
+        np.testing.assert_allclose(lin.A[:, both[:, None], both], single.A, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(lin.B[:, both[:, None], own], single.B, rtol=0, atol=1e-11)
+        if curved:
+            there = vp.second_order(alone, moved, z[both]).xx
+            np.testing.assert_allclose(xx[:, both[:, None], both], there, rtol=0, atol=1e-9)
+    # Between chains there is nothing, to the last bit.
+    for matrix in (lin.A, lin.B, xx):
+        assert not matrix[:, np.tile(between(parts), (2, matrix.shape[2] // 8))].any()
+
+
+@over_integrators
+def test_a_branch_between_two_that_a_mimic_joint_ties(tmp_path, integrator):
+    """Its coordinates stand between those of another group, so that both share a block."""
+    branches = {"a": "", "b": "", "c": mimic("a1", -0.5, 0.1)}
+    scenes = []
+    for names in ("abc", "ac"):
+        parts = [link(f"{name}_1") + joint(f"{name}1", "base", f"{name}_1", inside=branches[name]) for name in names]
+        parts += [link(f"{name}_2") + joint(f"{name}2", f"{name}_1", f"{name}_2") for name in names]
+        scenes.append(vp.Scene(vp.load_robot(write_urdf(tmp_path, *parts, name=names)), damping=0.1))
+    whole, without = scenes
+    assert whole.robot.joint_names == ("a1", "a2", "b1", "b2", "c2")
+    assert (whole.robot.tree.groups, list(whole.robot.tree.ends)) == (2, [5])
+    own = [0, 1, 4]
+    q, v = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 5))
+    motion = vp.simulate(whole, q, v, integrator=integrator, **STEPS)
+    apart = vp.simulate(without, q[own], v[own], integrator=integrator, **STEPS)
+    np.testing.assert_allclose(motion.q[:, own], apart.q, rtol=0, atol=1e-12)
+    A = vp.linearize(whole, motion).A
+    both = np.array([*own, *(5 + i for i in own)])
+    np.testing.assert_allclose(A[:, both[:, None], both], vp.linearize(without, apart).A, rtol=0, atol=1e-9)
+    group = whole.robot.tree.group
+    assert not A[:, np.tile(group[:, None] != group, (2, 2))].any()
+
+
+def test_in_halves():
+    """Steps that the guards split, with their derivatives chained."""
+    together, parts = forest()
+    scene, (q, v) = vp.Scene(together), np.random.default_rng(0).uniform(-1.0, 1.0, (2, 8))
+    motion = vp.simulate(scene, q, 4.0 * v, dt=0.1, steps=10, integrator=vp.Midpoint())
+    assert motion.statistics.split_steps > 3
+    lin = vp.linearize(scene, motion)
+    assert not lin.A[:, np.tile(between(parts), (2, 2))].any()
+    J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(8))
+    for A in lin.A:
+        np.testing.assert_allclose(A.T @ J @ A, J, rtol=0, atol=1e-9 * np.abs(A).max() ** 2)
 
 
 @pytest.fixture(scope="module")
@@ -16,45 +108,14 @@ def arms():
     return vp.load_robot("panda"), vp.load_robot("ur5", armature=0.02)
 
 
-def test_each_part_moves_as_by_itself(arms):
-    both = vp.combine(*arms, placements=[None, PLACE])
-    assert both.joint_names == arms[0].joint_names + arms[1].joint_names
-    rng = np.random.default_rng(0)
-    q, v = rng.normal(size=both.dof), rng.normal(size=both.dof)
-    options = {"dt": 1e-2, "steps": 10, "integrator": vp.Gauss(2)}
-    motion = vp.simulate(vp.Scene(both, damping="robot", gravity=(0.0, 1.0, -9.0)), q, v, **options)
-    first = 0
-    for robot, gravity in zip(arms, ([0.0, 1.0, -9.0], PLACE.rotation.T @ [0.0, 1.0, -9.0]), strict=True):
-        own = slice(first, first + robot.dof)
-        alone = vp.simulate(vp.Scene(robot, damping="robot", gravity=gravity), q[own], v[own], **options)
-        np.testing.assert_allclose(motion.q[:, own], alone.q, atol=1e-10)
-        first += robot.dof
-
-
 def test_what_robots_know_goes_along(arms):
     both = vp.combine(*arms, placements=[PLACE, None])
-    for what in ("effort_limit", "velocity_limit", "damping", "friction"):
+    assert both.joint_names == arms[0].joint_names + arms[1].joint_names
+    for what in ("effort_limit", "velocity_limit", "damping", "friction", "position_limits"):
         np.testing.assert_array_equal(getattr(both, what), np.hstack([getattr(robot, what) for robot in arms]))
-    np.testing.assert_array_equal(both.position_limits, np.hstack([robot.position_limits for robot in arms]))
     np.testing.assert_array_equal(both.posture("default")[:8], arms[0].posture("default"))
     np.testing.assert_array_equal(vp.Scene(both, damping=0).armature, [0.0] * 8 + [0.02] * 6)
     assert len(both.ties) == 1
-
-
-@pytest.mark.slow
-def test_shapes_stand_where_the_parts_put_them(arms):
-    both = vp.combine(*arms, placements=[None, PLACE])
-    q = np.random.default_rng(1).normal(size=both.dof)
-    found = placed(both, q)
-    assert found.keys() == placed(arms[0], q[:8]).keys() | placed(arms[1], q[8:]).keys()
-    for name, place in placed(arms[0], q[:8]).items():
-        np.testing.assert_allclose(found[name], place, atol=1e-12)
-    for name, place in placed(arms[1], q[8:]).items():
-        np.testing.assert_allclose(found[name], PLACE.homogeneous @ place, atol=1e-12)
-    shapes, missing = readable_geometry(both)
-    assert not missing
-    for shape in shapes.geometryObjects:
-        assert both.model.frames[shape.parentFrame].parentJoint == shape.parentJoint
 
 
 def placed(robot, q):
@@ -63,6 +124,21 @@ def placed(robot, q):
     of_shapes = shapes.createData()
     pin.updateGeometryPlacements(robot.model, data, shapes, of_shapes, robot.configuration(q))
     return {shape.name: place.homogeneous for shape, place in zip(shapes.geometryObjects, of_shapes.oMg, strict=True)}
+
+
+@pytest.mark.slow
+def test_shapes_stand_where_the_parts_put_them(arms):
+    both = vp.combine(*arms, placements=[None, PLACE])
+    q = np.random.default_rng(1).normal(size=both.dof)
+    moved = {name: PLACE.homogeneous @ place for name, place in placed(arms[1], q[8:]).items()}
+    expected, found = placed(arms[0], q[:8]) | moved, placed(both, q)
+    assert found.keys() == expected.keys()
+    for name, place in expected.items():
+        np.testing.assert_allclose(found[name], place, atol=1e-12)
+    shapes, missing = readable_geometry(both)
+    assert not missing
+    for shape in shapes.geometryObjects:
+        assert both.model.frames[shape.parentFrame].parentJoint == shape.parentJoint
 
 
 def test_names_that_clash_get_a_prefix(arms):
@@ -79,20 +155,20 @@ def test_names_that_clash_get_a_prefix(arms):
     assert vp.combine(locked, locked).locked == {"a_wrist_3_joint": 0.3, "b_wrist_3_joint": 0.3}
 
 
-WRONG = {
-    "one": (vp.combine, "robots"),
-    "no robot": (lambda arm: vp.combine(arm, "ur5"), "robots"),
-    "placements": (lambda arm: vp.combine(arm, arm, placements=[None]), ("placements", "2")),
-    "planar": (lambda arm: vp.combine(arm, arm, placements=[None, "planar"]), "base="),
-    "a place": (lambda arm: vp.combine(arm, arm, placements=[None, [2.0, 0.0, 0.0]]), ("placement", "'chain2'")),
-    "no rotation": (lambda arm: vp.combine(arm, arm, placements=[None, 2.0 * np.eye(4)]), "rotation"),
-    "prefixes": (lambda arm: vp.combine(arm, arm, prefixes="ab"), "prefixes"),
-    "alike": (lambda arm: vp.combine(arm, arm, prefixes=["", ""]), "'joint1'"),
-}
-
-
-@pytest.mark.parametrize("what", WRONG)
-def test_wrong_combinations_are_refused(what):
-    make, facts = WRONG[what]
+@pytest.mark.parametrize(
+    ("robots", "options", "facts"),
+    [
+        (1, {}, "robots"),
+        (["ur5"], {}, "robots"),
+        (2, {"placements": [None]}, ("placements", "2")),
+        (2, {"placements": [None, "planar"]}, "base="),
+        (2, {"placements": [None, [2.0, 0.0, 0.0]]}, ("placement", "'chain2'")),
+        (2, {"placements": [None, 2.0 * np.eye(4)]}, "rotation"),
+        (2, {"prefixes": "ab"}, "prefixes"),
+        (2, {"prefixes": ["", ""]}, "'joint1'"),
+    ],
+)
+def test_wrong_combinations_are_refused(robots, options, facts):
+    given = [vp.planar_chain(2)] * robots if isinstance(robots, int) else [vp.planar_chain(2), *robots]
     with refused(vp.InputError, facts):
-        make(vp.planar_chain(2))
+        vp.combine(*given, **options)

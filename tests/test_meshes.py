@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 from chromium import commands
 from mechanisms import INERTIAL, joint, link, write_urdf
-from refusals import naming, refused, unnamed
+from refusals import naming, refused
 
 import varpin as vp
 from varpin.model import geometry, readable_geometry
@@ -19,8 +19,8 @@ from varpin.model.meshes import read_mesh
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 
 
-def mesh(name):
-    return f'<visual><geometry><mesh filename="{name}"/></geometry></visual>'
+def mesh(name, scale="1 1 1"):
+    return f'<visual><geometry><mesh filename="{name}" scale="{scale}"/></geometry></visual>'
 
 
 @pytest.fixture
@@ -34,8 +34,8 @@ def package(tmp_path):
     return folder
 
 
-def two_links(folder, first, second=""):
-    parts = [link("l1", INERTIAL, first), link("l2", INERTIAL, second)]
+def two_links(folder, first="", second="", inertial=INERTIAL):
+    parts = [link("l1", INERTIAL, first), link("l2", inertial, second)]
     return write_urdf(folder, *parts, joint("j1", "base", "l1"), joint("j2", "l1", "l2"))
 
 
@@ -57,18 +57,20 @@ def test_found_from_any_folder(package, tmp_path, monkeypatch, name):
     assert Path(shape.meshPath).samefile(file)
 
 
-@pytest.mark.parametrize("variable", ["ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH", ""])
-def test_packages_elsewhere(package, tmp_path, monkeypatch, variable):
-    path = two_links(tmp_path, mesh("package://my_arm/meshes/ball.obj"))
-    monkeypatch.delenv("ROS_PACKAGE_PATH", raising=False)
-    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+def test_packages_elsewhere(package, tmp_path, monkeypatch):
+    path, folder = two_links(tmp_path, mesh("package://my_arm/meshes/ball.obj")), package.parent
+    (tmp_path / "share").symlink_to(folder)
+    places = {"ROS_PACKAGE_PATH": folder, "AMENT_PREFIX_PATH": tmp_path}
+    for variable in places:
+        monkeypatch.delenv(variable, raising=False)
     with refused(vp.RobotError, "ball.obj"):
         geometry(vp.load_robot(path))
-    (tmp_path / "share").symlink_to(package.parent)
-    if variable:
-        monkeypatch.setenv(variable, str(package.parent if variable.startswith("ROS") else tmp_path))
-    folders = [] if variable else [package.parent]
-    assert geometry(vp.load_robot(path, package_dirs=folders)).ngeoms == 1
+    for folders in ([folder], folder, str(folder)):
+        assert geometry(vp.load_robot(path, package_dirs=folders)).ngeoms == 1
+    for variable, place in places.items():
+        with monkeypatch.context() as patch:
+            patch.setenv(variable, str(place))
+            assert geometry(vp.load_robot(path)).ngeoms == 1
 
 
 @pytest.mark.parametrize("name", ["package://my_arm/Meshes/ball.obj", "../meshes/BALL.obj"])
@@ -79,11 +81,8 @@ def test_a_file_in_other_case_is_named(package, name):
 
 
 def test_every_link_is_named_and_where_was_looked(package, tmp_path, caplog):
-    path = two_links(
-        package / "urdf",
-        mesh("package://lost/a.stl") + mesh("package://my_arm/meshes/ball.obj"),
-        mesh("b.stl") + mesh("http://c"),
-    )
+    first = mesh("package://lost/a.stl") + mesh("package://my_arm/meshes/ball.obj")
+    path = two_links(package / "urdf", first, mesh("b.stl") + mesh("http://c"))
     robot = vp.load_robot(path, package_dirs=[tmp_path])
     looked = f"{tmp_path}, {package.parent}, {path.parent}"
     needed = (str(path), "'l1'", "package://lost/a.stl", "'l2'", "b.stl, http://c", looked, "package_dirs=")
@@ -92,7 +91,7 @@ def test_every_link_is_named_and_where_was_looked(package, tmp_path, caplog):
     shapes, missing = readable_geometry(robot)
     assert shapes.ngeoms == 0
     assert {name: at for name, (at, _) in missing.items()} == {"l1": 1, "l2": 2}
-    assert not [unnamed(text, *needed) for _, text in missing.values() if unnamed(text, *needed)]
+    assert len(naming((text for _, text in missing.values()), needed)) == 2
 
 
 # A box of 0.1 x 0.2 x 0.3 m with a corner at the origin.
@@ -132,19 +131,12 @@ def wavefront(corners=CORNERS, faces=QUADS):
     return "\n".join(lines) + "\n"
 
 
+FACET = "facet normal 0 0 0\nouter loop\n{}endloop\nendfacet\n"
+
+
 def ascii_stl(triangles=TRIANGLES, name="box"):
-    facets = (
-        "".join(
-            "facet normal 0 0 0 outer loop "
-            + " ".join(f"vertex {words(CORNERS[k])}" for k in face)
-            + " endloop endfacet\n"
-            for face in triangles
-        )
-        .replace(" outer", "\nouter")
-        .replace(" vertex", "\nvertex")
-        .replace(" endloop ", "\nendloop\n")
-    )
-    return f"solid {name}\n{facets}endsolid {name}\n"
+    facets = (FACET.format("".join(f"vertex {words(CORNERS[k])}\n" for k in face)) for face in triangles)
+    return f"solid {name}\n{''.join(facets)}endsolid {name}\n"
 
 
 def binary_stl(corners=CORNERS):
@@ -167,41 +159,40 @@ NO_MATERIAL = (
     '<instance_geometry url="#g"><bind_material><technique_common><instance_material symbol="red" target="#gone"/>'
     "</technique_common></bind_material></instance_geometry>"
 )
-MATERIALS = "mtllib a.mtl\n"
-
-# Files of the same box, and the scale in the URDF.
+OFF = [*(words(corner) for corner in CORNERS), *(f"3 {words(face)}" for face in TRIANGLES)]
+# Files of the same box; and below the scale in the URDF of those of another size.
 FILES = {
-    "centimetres.dae": (collada(CORNERS / 0.01, '<unit meter="0.01" name="cm"/>'), "1 1 1"),
-    "inches.dae": (collada(CORNERS / 0.0254, '<unit name="inch" meter="2.54e-2"/>', "Y_UP"), "1 1 1"),
-    "no_unit.dae": (collada(unit=""), "1 1 1"),
-    "unit_and_scale.dae": (collada(CORNERS / 0.01, '<unit meter="0.001"/>'), "10 10 10"),
-    "nested.dae": (collada(CORNERS * [2.0, 0.5, 1.0], node=NESTED), "1 1 1"),
-    "mirrored_node.dae": (collada(node=MIRRORED), "1 1 1"),
-    "twice.dae": (collada(node=TWICE), "1 1 1"),
-    "two_materials.dae": (collada(primitives=HALVES), "1 1 1"),
-    "lines.dae": (collada(primitives=LINES), "1 1 1"),
-    "polylist.dae": (collada(primitives=POLYLIST), "1 1 1"),
-    "polygons.DAE": (collada(primitives=POLYGONS), "1 1 1"),
-    "fans.dae": (collada(primitives=FANS), "1 1 1"),
-    "no_material.dae": (collada(primitives=HALVES, node=NO_MATERIAL), "1 1 1"),
-    "mixed.obj": (wavefront(faces=[*QUADS[:3], *TRIANGLES[3:6], *TRIANGLES[9:]]), "1 1 1"),
-    "materials.obj": (
-        MATERIALS + wavefront(faces=QUADS[:2]) + "usemtl red\n" + wavefront(faces=QUADS[2:4] + 8)
-        + "usemtl blue\n" + wavefront(faces=QUADS[4:] + 16),
-        "1 1 1",
-    ),
-    "objects.obj": ("o one\n" + wavefront(faces=QUADS[:3]) + "o two\n" + wavefront(faces=QUADS[3:] + 8), "1 1 1"),
-    "mirrored.obj": (wavefront(CORNERS * [1.0, -1.0, 1.0], QUADS[:, ::-1]), "1 -1 1"),
-    "through_a_point.obj": (wavefront(-CORNERS, QUADS[:, ::-1]), "-1 -1 -1"),
-    "box.off": (
-        f"OFF\n8 12 0\n{chr(10).join(map(words, CORNERS))}\n{chr(10).join(f'3 {words(face)}' for face in TRIANGLES)}\n",
-        "1 1 1",
-    ),
-    "ascii.stl": (ascii_stl(), "1 1 1"),
-    "two_solids.stl": (ascii_stl(TRIANGLES[:5]) + ascii_stl(TRIANGLES[5:], "rest"), "1 1 1"),
-    "binary.STL": (binary_stl(), "1 1 1"),
-    "millimetres.stl": (binary_stl(1000.0 * CORNERS), "0.001 0.001 0.001"),
-}  # fmt: skip
+    "centimetres.dae": collada(CORNERS / 0.01, '<unit meter="0.01" name="cm"/>'),
+    "inches.dae": collada(CORNERS / 0.0254, '<unit name="inch" meter="2.54e-2"/>', "Y_UP"),
+    "no_unit.dae": collada(unit=""),
+    "unit_and_scale.dae": collada(CORNERS / 0.01, '<unit meter="0.001"/>'),
+    "nested.dae": collada(CORNERS * [2.0, 0.5, 1.0], node=NESTED),
+    "mirrored_node.dae": collada(node=MIRRORED),
+    "twice.dae": collada(node=TWICE),
+    "two_materials.dae": collada(primitives=HALVES),
+    "lines.dae": collada(primitives=LINES),
+    "polylist.dae": collada(primitives=POLYLIST),
+    "polygons.DAE": collada(primitives=POLYGONS),
+    "fans.dae": collada(primitives=FANS),
+    "no_material.dae": collada(primitives=HALVES, node=NO_MATERIAL),
+    "mixed.obj": wavefront(faces=[*QUADS[:3], *TRIANGLES[3:6], *TRIANGLES[9:]]),
+    "materials.obj": "mtllib a.mtl\n"
+    + wavefront(faces=QUADS[:2])
+    + "usemtl red\n"
+    + wavefront(faces=QUADS[2:4] + 8)
+    + "usemtl blue\n"
+    + wavefront(faces=QUADS[4:] + 16),
+    "objects.obj": "o one\n" + wavefront(faces=QUADS[:3]) + "o two\n" + wavefront(faces=QUADS[3:] + 8),
+    "mirrored.obj": wavefront(CORNERS * [1.0, -1.0, 1.0], QUADS[:, ::-1]),
+    "through_a_point.obj": wavefront(-CORNERS, QUADS[:, ::-1]),
+    "box.off": "\n".join(["OFF", "8 12 0", *OFF, ""]),
+    "ascii.stl": ascii_stl(),
+    "two_solids.stl": ascii_stl(TRIANGLES[:5]) + ascii_stl(TRIANGLES[5:], "rest"),
+    "binary.STL": binary_stl(),
+    "millimetres.stl": binary_stl(1000.0 * CORNERS),
+}
+SCALES = {"unit_and_scale.dae": "10 10 10", "mirrored.obj": "1 -1 1", "through_a_point.obj": "-1 -1 -1"}
+SCALES |= {"millimetres.stl": "0.001 0.001 0.001"}
 
 
 def drawn(page):
@@ -219,14 +210,14 @@ def volume(triangles):
     return np.linalg.det(triangles).sum() / 6.0
 
 
-def arm(folder, name, scale):
-    shape = f'<visual><geometry><mesh filename="{name}" scale="{scale}"/></geometry></visual>'
-    return write_urdf(folder, link("l1"), link("l2", "", shape), joint("j1", "base", "l1"), joint("j2", "l1", "l2"))
+def arm(folder, name, scale="1 1 1"):
+    """Its second link has a mesh and no inertia."""
+    return two_links(folder, "", mesh(name, scale), "")
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_a_box_is_a_box_in_every_file(tmp_path, caplog, name):
-    content, scale = FILES[name]
+    content, scale = FILES[name], SCALES.get(name, "1 1 1")
     (tmp_path / "a.mtl").write_text("newmtl red\nKd 1 0 0\nnewmtl blue\nKd 0 0 1\nd 0.5\n")
     (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     path = arm(tmp_path, name, scale)
@@ -299,11 +290,11 @@ def test_what_is_no_mesh_is_named_with_its_cause(tmp_path, name, content, facts)
     with refused(vp.FileError, facts):
         vp.Obstacle.mesh(tmp_path / name)
     with refused(vp.RobotError, ("'l2'", *facts)):
-        geometry(vp.load_robot(arm(tmp_path, name, "1 1 1"), lock={"j2": 0.0}))
+        geometry(vp.load_robot(arm(tmp_path, name), lock={"j2": 0.0}))
 
 
-def test_meshes_without_a_volume_are_named(tmp_path):
-    path = arm(tmp_path, "a.obj", "1 1 1")
+def test_meshes_without_a_volume_and_scales_that_are_none_are_named(tmp_path):
+    path = arm(tmp_path, "a.obj")
     for faces in (QUADS[:, ::-1], QUADS[:5]):
         (tmp_path / "a.obj").write_text(wavefront(faces=faces))
         with refused(vp.RobotError, "'l2'", "a.obj", "no volume"):
@@ -311,22 +302,15 @@ def test_meshes_without_a_volume_are_named(tmp_path):
     (tmp_path / "a.obj").unlink()
     with refused(vp.RobotError, "'l2'", "a.obj", "package_dirs"):
         vp.load_robot(path, inertia="meshes")
-
-
-@pytest.mark.parametrize("scale", ["1 1", "1 0 1", "one 1 1", "inf 1 1"])
-def test_scales_are_three_numbers(tmp_path, scale):
     (tmp_path / "a.obj").write_text(wavefront())
-    with refused(vp.RobotError, "'l2'", "a.obj", repr(scale)):
-        vp.load_robot(arm(tmp_path, "a.obj", scale), inertia="meshes")
+    for scale in ("1 1", "1 0 1", "one 1 1", "inf 1 1"):
+        with refused(vp.RobotError, "'l2'", "a.obj", repr(scale)):
+            vp.load_robot(arm(tmp_path, "a.obj", scale), inertia="meshes")
 
 
-@pytest.mark.parametrize(
-    ("scale", "told"), [("1 1 1", False), ("1000 1000 1000", True), ("39.4 39.4 39.4", True), ("1e-3 1e-3 1e-3", True)]
-)
-def test_a_mesh_in_other_units_is_told(tmp_path, scale, told):
+@pytest.mark.parametrize("scale", ["1 1 1", "1000 1000 1000", "39.4 39.4 39.4", "1e-3 1e-3 1e-3"])
+def test_a_mesh_in_other_units_is_told(tmp_path, scale):
     (tmp_path / "a.stl").write_bytes(binary_stl())
-    shape = f'<visual><geometry><mesh filename="a.stl" scale="{scale}"/></geometry></visual>'
-    path = write_urdf(tmp_path, link("l1", extra=shape), link("l2"), joint("j1", "base", "l1"), joint("j2", "l1", "l2"))
-    warnings = vp.inspect_robot(path).warnings
-    assert bool(naming(warnings, "mesh 'a.stl'", "'l1'", "scale=")) == told
+    warnings = vp.inspect_robot(two_links(tmp_path, mesh("a.stl", scale))).warnings
+    assert bool(naming(warnings, "mesh 'a.stl'", "'l1'", "scale=")) == (scale != "1 1 1")
     assert all(len(warning) <= 240 for warning in warnings)

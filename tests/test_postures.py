@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -15,18 +13,16 @@ from refusals import refused, unnamed
 import varpin as vp
 
 # Robots of example-robot-data and the postures in their SRDF files, under srdf/ of each.
-PUBLISHED = {
-    "alex_nub_hands": ("alex_nub_hands", ("default",)),
-    "alex_psyonic_hands": ("alex_psyonic_hands", ("default",)),
-    "alex_sake_hands": ("alex_sake_hands", ("default",)),
-    "finger_edu": ("finger_edu", ("hanging",)),
-    "kinova": ("kinova", ("arm_up",)),
-    "panda": ("panda", ("default",)),
-    "panda_collision": ("panda", ("default",)),
-    "talos_arm": ("talos", ("half_sitting",)),
-    "xarm7": ("xarm7", ("home", "hold-up")),
-    "z1": ("z1", ("home", "arm_up")),
-}
+PUBLISHED = {name: (name, ("default",)) for name in ("alex_nub_hands", "alex_psyonic_hands", "alex_sake_hands")}
+PUBLISHED |= {"panda": ("panda", ("default",)), "panda_collision": ("panda", ("default",))}
+PUBLISHED |= {"finger_edu": ("finger_edu", ("hanging",)), "kinova": ("kinova", ("arm_up",))}
+PUBLISHED |= {"talos_arm": ("talos", ("half_sitting",)), "xarm7": ("xarm7", ("home", "hold-up"))}
+PUBLISHED |= {"z1": ("z1", ("home", "arm_up"))}
+
+
+def of_joint(model, q, name):
+    own = model.joints[model.getJointId(name)]
+    return q[own.idx_q : own.idx_q + own.nq]
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
@@ -34,18 +30,11 @@ def test_published_postures_are_pinocchio_s(load, name):
     robot, (file, names) = load(name), PUBLISHED[name]
     assert robot.postures == names
     model = pin.buildModelFromUrdf(str(robot.urdf))
-    path = robot.urdf.parent.parent / "srdf" / f"{file}.srdf"
-    pin.loadReferenceConfigurations(model, str(path))
+    pin.loadReferenceConfigurations(model, str(robot.urdf.parent.parent / "srdf" / f"{file}.srdf"))
     for posture in names:
         q, expected = robot.configuration(robot.posture(posture)), model.referenceConfigurations[posture]
-        for joint_name in robot.joint_names:
-            one, other = (
-                robot.model.joints[robot.model.getJointId(joint_name)],
-                model.joints[model.getJointId(joint_name)],
-            )
-            np.testing.assert_allclose(
-                q[one.idx_q : one.idx_q + one.nq], expected[other.idx_q : other.idx_q + other.nq], atol=1e-12
-            )
+        for each in robot.joint_names:
+            np.testing.assert_allclose(of_joint(robot.model, q, each), of_joint(model, expected, each), atol=1e-12)
 
 
 SRDF = """<robot name="made_up">
@@ -78,7 +67,7 @@ def test_coordinates_of_a_posture(urdf):
     assert pickle.loads(pickle.dumps(robot)).posture("home").tolist() == [0.5, -0.25, 0.0]
 
 
-def test_errors_of_a_call(urdf):
+def test_names_and_files_that_are_not_there(urdf):
     (urdf.parent / "made_up.srdf").write_text(SRDF)
     robot = vp.load_robot(urdf)
     with refused(vp.UnknownPosture, "'hme'", "'home'", "'there'") as caught:
@@ -92,6 +81,10 @@ def test_errors_of_a_call(urdf):
         robot.posture("home", others={"j9": 1.0})
     with refused(vp.UnknownPosture, "srdf=path"):
         vp.load_robot("ur5").posture("home")
+    with refused(vp.FileError, "lost.srdf"):
+        vp.load_robot(urdf, srdf="lost.srdf")
+    with refused(vp.InputError, "srdf", "3"):
+        vp.load_robot(urdf, srdf=3)
 
 
 @pytest.mark.parametrize(
@@ -137,13 +130,6 @@ def test_bad_files(urdf, caplog, kind):
     assert not unnamed(caplog.text, facts)
 
 
-def test_files_that_are_none(urdf):
-    with refused(vp.FileError, "lost.srdf"):
-        vp.load_robot(urdf, srdf="lost.srdf")
-    with refused(vp.InputError, "srdf", "3"):
-        vp.load_robot(urdf, srdf=3)
-
-
 def test_xacro_file(urdf, tmp_path):
     pytest.importorskip("xacro")
     path = tmp_path / "any.srdf.xacro"
@@ -160,19 +146,3 @@ def test_reference_configurations_of_a_model(urdf):
     model.referenceConfigurations["here"] = q
     robot = vp.load_robot(model)
     np.testing.assert_allclose(robot.configuration(robot.posture("here")), q, atol=1e-15)
-
-
-def test_of_robot_descriptions(urdf, tmp_path, monkeypatch):
-    srdf = tmp_path / "elsewhere" / "any.srdf"
-    srdf.parent.mkdir()
-    srdf.write_text(SRDF)
-
-    module = SimpleNamespace(
-        DESCRIPTIONS={"one_description": SimpleNamespace(tags={"arm"})},
-        PACKAGE_PATH=str(tmp_path),
-        URDF_PATH=str(urdf),
-        SRDF_PATH=str(srdf),
-    )
-    for name in ("robot_descriptions", "robot_descriptions.one_description"):
-        monkeypatch.setitem(sys.modules, name, module)
-    assert vp.load_robot("one_description").postures == ("home", "there")

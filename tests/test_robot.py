@@ -1,35 +1,19 @@
 from __future__ import annotations
 
-import logging
-import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import naive
 import numpy as np
 import pinocchio as pin
 import pytest
-from mechanisms import arm, joint, link, mimic, random_inertia, random_tree, write_urdf
+from mechanisms import arm, joint, link, mass_matrix, mimic, random_inertia, random_rotation, random_tree, write_urdf
+from oracles import placements
 from refusals import naming, refused
 
 import varpin as vp
 from varpin.model import example_robot_data, geometry
 
 MOVING = ("revolute", "continuous", "prismatic")
-
-
-def configuration(model: pin.Model, positions: np.ndarray) -> np.ndarray:
-    q = pin.neutral(model)
-    for k in range(model.njoints - 1):
-        entry = model.joints[k + 1]
-        q[entry.idx_q : entry.idx_q + entry.nq] = (
-            positions[k] if entry.nq == 1 else (np.cos(positions[k]), np.sin(positions[k]))
-        )
-    return q
-
-
-def full_crba(model: pin.Model, q: np.ndarray) -> np.ndarray:
-    M = np.triu(pin.crba(model, model.createData(), q))
-    return M + np.triu(M, 1).T
 
 
 def jet_at(robot: vp.Robot, q, v) -> vp.LagrangianJet:
@@ -62,12 +46,11 @@ class TestSources:
         named = load(name)
         model = pin.buildModelFromUrdf(str(named.urdf), mimic=True)
         q, v = np.random.default_rng(3).uniform(-4.0, 4.0, (2, named.dof))
-        for source in (model, pin.RobotWrapper(model)):
-            robot = vp.load_robot(source)
-            order = [robot.joint_names.index(joint_name) for joint_name in named.joint_names]
-            back = np.argsort(order)
-            assert_same_jet(jet_at(named, q, v), jet_at(robot, q[back], v[back]), keep=order)
-            assert len(robot.ties) == len(named.ties)
+        robot = vp.load_robot(pin.RobotWrapper(model))
+        order = [robot.joint_names.index(joint_name) for joint_name in named.joint_names]
+        back = np.argsort(order)
+        assert_same_jet(jet_at(named, q, v), jet_at(robot, q[back], v[back]), keep=order)
+        assert len(robot.ties) == len(named.ties)
 
     @pytest.mark.parametrize("frames", [True, False])
     def test_the_robot_keeps_no_hold_of_the_user_s_model(self, load, frames):
@@ -89,11 +72,8 @@ class TestSources:
         model = random_tree(0, branching=False)
         model.gravity = pin.Motion(np.array(gravity), np.zeros(3))
         q = np.ones(7)
-        for robot in (
-            vp.load_robot(model),
-            vp.load_robot(model, base=np.eye(4)),
-            vp.load_robot(pin.RobotWrapper(model)),
-        ):
+        wrapped = pin.RobotWrapper(model)
+        for robot in (vp.load_robot(model), vp.load_robot(model, base=np.eye(4)), vp.load_robot(wrapped)):
             held = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), robot.configuration(q))
             assert vp.Scene(robot).gravity.tolist() == list(gravity)
             np.testing.assert_allclose(vp.Scene(robot).holding_torque(q), held, rtol=0, atol=1e-12)
@@ -116,8 +96,7 @@ class TestSources:
         shapes = pin.GeometryModel()
         for k, name in enumerate(parents):
             shapes.addGeometryObject(pin.GeometryObject(name, k + 1, pin.SE3.Identity(), pin.hppfcl.Sphere(0.1)))
-        with caplog.at_level(logging.WARNING):
-            robot = vp.load_robot(pin.RobotWrapper(model, shapes, shapes))
+        robot = vp.load_robot(pin.RobotWrapper(model, shapes, shapes))
         assert robot.joint_names == ("left", "left_tip", "right", "right_tip")
         assert naming(caplog.messages, "left, left_tip, right, right_tip")
         assert [robot.model.names[shape.parentJoint] for shape in geometry(robot).geometryObjects] == list(parents)
@@ -128,66 +107,64 @@ class TestSources:
             assert pytest.approx(expected, rel=1e-13) == vp.lagrangian_jet(scene, q, v, backend=backend).L
 
 
-class TestGeometry:
-    def test_is_not_read_at_load(self, tmp_path):
-        mesh = '<visual><geometry><mesh filename="package://nowhere/missing.dae"/></geometry></visual>'
-        robot = vp.load_robot(write_urdf(tmp_path, link("l1", extra=mesh), joint("j1", "base", "l1")))
-        assert robot.dof == 1
-        with refused(vp.RobotError, "missing.dae"):
-            geometry(robot)
-
-    @pytest.mark.parametrize("lock", [{}, {"joint1": 0.4}, {"joint0": -0.3, "joint5": 1.2}])
-    def test_of_a_wrapper_moves_as_in_the_unlocked_model(self, lock):
-        model = random_tree(11, branching=False)
-        rng = np.random.default_rng(0)
-        shapes = pin.GeometryModel()
-        for k in range(1, model.njoints):
-            placement = pin.SE3(pin.Quaternion(rng.normal(size=4)).normalized().matrix(), rng.normal(size=3))
-            shapes.addGeometryObject(pin.GeometryObject(f"shape{k}", k, placement, pin.hppfcl.Sphere(0.1)))
-        robot = vp.load_robot(pin.RobotWrapper(model, pin.GeometryModel(), shapes), lock=lock)
-        visuals = geometry(robot)
-        assert all(shape.parentFrame < robot.model.nframes for shape in visuals.geometryObjects)
-        q = rng.uniform(-2.0, 2.0, robot.dof)
-        positions = dict(zip(robot.joint_names, q, strict=True)) | lock
-        full_q = configuration(model, np.array([positions[name] for name in list(model.names)[1:]]))
-        ours, theirs = visuals.createData(), shapes.createData()
-        pin.updateGeometryPlacements(robot.model, robot.model.createData(), visuals, ours, robot.configuration(q))
-        pin.updateGeometryPlacements(model, model.createData(), shapes, theirs, full_q)
-        assert visuals.ngeoms == shapes.ngeoms
-        for k, shape in enumerate(shapes.geometryObjects):
-            mine = ours.oMg[visuals.getGeometryId(shape.name)]
-            assert np.abs(mine.homogeneous - theirs.oMg[k].homogeneous).max() < 1e-12
+@pytest.mark.parametrize("lock", [{}, {"joint1": 0.4}, {"joint0": -0.3, "joint5": 1.2}])
+def test_shapes_of_a_wrapper_move_as_in_the_unlocked_model(lock):
+    model, rng = random_tree(11, branching=False), np.random.default_rng(0)
+    shapes = pin.GeometryModel()
+    for k in range(1, model.njoints):
+        placement = pin.SE3(random_rotation(rng), rng.normal(size=3))
+        shapes.addGeometryObject(pin.GeometryObject(f"shape{k}", k, placement, pin.hppfcl.Sphere(0.1)))
+    whole = vp.load_robot(model)
+    robot = vp.load_robot(pin.RobotWrapper(model, pin.GeometryModel(), shapes), lock=lock)
+    visuals = geometry(robot)
+    assert all(shape.parentFrame < robot.model.nframes for shape in visuals.geometryObjects)
+    q = rng.uniform(-2.0, 2.0, robot.dof)
+    positions = dict(zip(robot.joint_names, q, strict=True)) | lock
+    full = np.array([positions[name] for name in whole.joint_names])
+    ours, theirs = visuals.createData(), shapes.createData()
+    pin.updateGeometryPlacements(robot.model, robot.model.createData(), visuals, ours, robot.configuration(q))
+    pin.updateGeometryPlacements(model, model.createData(), shapes, theirs, whole.configuration(full))
+    assert visuals.ngeoms == shapes.ngeoms
+    for k, shape in enumerate(shapes.geometryObjects):
+        mine = ours.oMg[visuals.getGeometryId(shape.name)]
+        assert np.abs(mine.homogeneous - theirs.oMg[k].homogeneous).max() < 1e-12
 
 
-class TestKeeping:
-    def test_locks_all_other_joints_where_they_may_be(self, load):
-        whole = load("panda")
-        robot = vp.load_robot("panda", keep=["panda_joint2", "panda_joint7"], lock={"panda_joint5": 0.3})
-        assert robot.joint_names == ("panda_joint2", "panda_joint7")
-        lower, upper = whole.position_limits
-        nearest = dict(zip(whole.joint_names, np.clip(0.0, lower, upper), strict=True)) | {"panda_joint5": 0.3}
-        for name, at in robot.locked.items():
-            assert at == pytest.approx(nearest.get(name, 0.0))
-        same = vp.load_robot("panda", lock={k: v for k, v in nearest.items() if k not in robot.joint_names})
-        assert_same_jet(jet_at(robot, [0.1, 0.2], [1.0, 2.0]), jet_at(same, [0.1, 0.2], [1.0, 2.0]), rtol=0)
+def test_keeping_locks_all_other_joints_where_they_may_be(load):
+    whole = load("panda")
+    robot = vp.load_robot("panda", keep=["panda_joint2", "panda_joint7"], lock={"panda_joint5": 0.3})
+    assert robot.joint_names == ("panda_joint2", "panda_joint7")
+    nearest = dict(zip(whole.joint_names, np.clip(0.0, *whole.position_limits), strict=True)) | {"panda_joint5": 0.3}
+    for name, at in robot.locked.items():
+        assert at == pytest.approx(nearest.get(name, 0.0))
+    same = vp.load_robot("panda", lock={k: v for k, v in nearest.items() if k not in robot.joint_names})
+    assert_same_jet(jet_at(robot, [0.1, 0.2], [1.0, 2.0]), jet_at(same, [0.1, 0.2], [1.0, 2.0]), rtol=0)
 
-    def test_keeps_followers_with_their_leader(self):
-        robot = vp.load_robot("panda", keep=["panda_finger_joint1"])
-        assert robot.joint_names == ("panda_finger_joint1",)
-        assert len(robot.ties) == 1
-        with refused(vp.InputError, "panda_finger_joint2", "panda_finger_joint1"):
-            vp.load_robot("panda", keep=["panda_finger_joint2"])
 
-    def test_refuses_names_and_forms(self):
-        for keep in ("elbow_joint", {"elbow_joint": 0.0}):
-            with refused(vp.InputError, "keep"):
-                vp.load_robot("ur5", keep=keep)
-        with refused(vp.UnknownJoint, "keep", "'elbow'", "'elbow_joint'"):
-            vp.load_robot("ur5", keep=["elbow"])
-        with refused(vp.InputError, "'elbow_joint'", "keep", "lock"):
-            vp.load_robot("ur5", keep=["elbow_joint"], lock={"elbow_joint": 0.1})
-        with refused(vp.RobotError, "no joint that moves"):
-            vp.load_robot("ur5", keep=[])
+def test_followers_are_kept_and_locked_with_their_leader():
+    robot = vp.load_robot("panda", keep=["panda_finger_joint1"])
+    assert robot.joint_names == ("panda_finger_joint1",)
+    assert len(robot.ties) == 1
+    with refused(vp.InputError, "panda_finger_joint2", "panda_finger_joint1"):
+        vp.load_robot("panda", keep=["panda_finger_joint2"])
+    robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.03})
+    assert dict(robot.locked) == {"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.03}
+    assert robot.ties == ()
+
+
+@pytest.mark.parametrize(
+    ("options", "kind", "facts"),
+    [
+        ({"keep": "elbow_joint"}, vp.InputError, "keep"),
+        ({"keep": {"elbow_joint": 0.0}}, vp.InputError, "keep"),
+        ({"keep": ["elbow"]}, vp.UnknownJoint, ("keep", "'elbow'", "'elbow_joint'")),
+        ({"keep": ["elbow_joint"], "lock": {"elbow_joint": 0.1}}, vp.InputError, ("'elbow_joint'", "keep", "lock")),
+        ({"keep": []}, vp.RobotError, "no joint that moves"),
+    ],
+)
+def test_names_and_forms_that_are_not_kept(options, kind, facts):
+    with refused(kind, facts):
+        vp.load_robot("ur5", **options)
 
 
 class TestLocking:
@@ -212,31 +189,14 @@ class TestLocking:
             q[whole.coordinate(joint_name)], v[whole.coordinate(joint_name)] = position, 0.0
         locked, unlocked = jet_at(robot, q[keep], v[keep]), jet_at(whole, q, v)
         assert_same_jet(locked, unlocked, keep)
+        for frame in list(robot.model.frames)[1:]:
+            (mine,), (its,) = placements(robot, q[None, keep], frame.name), placements(whole, q[None], frame.name)
+            np.testing.assert_allclose(mine.homogeneous, its.homogeneous, rtol=0, atol=1e-13, err_msg=frame.name)
         elsewhere = q.copy()
         elsewhere[keep] = rng.uniform(-1.0, 1.0, len(keep))
         # What hangs on the world for good adds a constant to the potential energy.
-        shift = locked.L - unlocked.L
-        assert (
-            pytest.approx(shift, abs=1e-11) == jet_at(robot, elsewhere[keep], v[keep]).L - jet_at(whole, elsewhere, v).L
-        )
-
-    def test_is_pinocchio_s_reduced_model(self, load):
-        name, held = "kinova", (0, 2)
-        whole = load(name)
-        at = {whole.joint_names[c]: 0.3 - 0.2 * c for c in held}
-        robot, full = vp.load_robot(name, lock=at), whole.model
-        q = whole.configuration([at.get(joint_name, 0.0) for joint_name in whole.joint_names])
-        expected = pin.buildReducedModel(full, [full.getJointId(joint_name) for joint_name in at], q)
-        assert list(robot.model.names) == list(expected.names)
-        positions = robot.configuration(np.random.default_rng(1).uniform(-1.0, 1.0, robot.dof))
-        ours, theirs = robot.model.createData(), expected.createData()
-        for model, data in ((robot.model, ours), (expected, theirs)):
-            pin.framesForwardKinematics(model, data, positions)
-        for k, frame in enumerate(robot.model.frames):
-            other = theirs.oMf[expected.getFrameId(frame.name, frame.type)]
-            np.testing.assert_allclose(ours.oMf[k].homogeneous, other.homogeneous, rtol=0, atol=1e-14)
-        M, other = full_crba(robot.model, positions), full_crba(expected, positions)
-        np.testing.assert_allclose(M, other, rtol=0, atol=1e-13 * np.abs(other).max())
+        shift = jet_at(robot, elsewhere[keep], v[keep]).L - jet_at(whole, elsewhere, v).L
+        assert pytest.approx(shift, abs=1e-11) == locked.L - unlocked.L
 
     @pytest.mark.parametrize("lock", [{}, {"wrist_roll": 0.2}, {"gripper": 0.3}])
     def test_a_link_keeps_the_name_that_a_joint_elsewhere_has_too(self, tmp_path, lock):
@@ -253,218 +213,167 @@ class TestLocking:
         assert kinds == sorted(["BODY", "FIXED_JOINT" if "gripper" in lock else "JOINT"])
         vp.replay(robot, own[None], dt=0.1, marks=vp.Marks(trace="gripper"), html=tmp_path / "gripper.html")
 
-    def test_of_a_leader_locks_its_followers(self):
-        robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.03})
-        assert dict(robot.locked) == {"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.03}
-        assert robot.ties == ()
 
-    @pytest.mark.parametrize(
-        ("kind", "position"),
-        [
-            (
-                pin.JointModelFreeFlyer(),
-                [0.1, 0.2, 0.3, *pin.Quaternion(np.array([0.1, 0.2, 0.3, 0.9])).normalized().coeffs()],
-            ),
-            (pin.JointModelSpherical(), pin.Quaternion(np.array([0.5, 0.2, -0.3, 0.9])).normalized().coeffs()),
-            (pin.JointModelPlanar(), [0.4, 0.5, np.cos(0.6), np.sin(0.6)]),
-            (pin.JointModelHX(0.2), 1.3),
-            (pin.JointModelTranslation(), [1.0, 2.0, 3.0]),
-        ],
-        ids=lambda value: value.shortname() if hasattr(value, "shortname") else "",
-    )
-    def test_the_advice_against_an_unsupported_joint_works(self, kind, position):
-        rng = np.random.default_rng(3)
-        model = pin.Model()
-        base = model.addJoint(0, kind, pin.SE3.Identity(), "root")
-        model.appendBodyToJoint(base, random_inertia(rng), pin.SE3.Identity())
-        elbow = model.addJoint(base, pin.JointModelRY(), pin.SE3(np.eye(3), np.array([0.1, 0.2, 0.3])), "elbow")
-        model.appendBodyToJoint(elbow, random_inertia(rng), pin.SE3.Identity())
-        with refused(vp.UnsupportedJoint, "'root'", kind.shortname(), "lock={'root': "):
-            vp.load_robot(model)
-        robot = vp.load_robot(model, lock={"root": position})
-        assert robot.joint_names == ("elbow",)
-        q = pin.neutral(model)
-        q[: model.joints[base].nq] = position
-        for angle in (0.3, -1.2):
-            q[model.joints[elbow].idx_q] = angle
-            jet = vp.lagrangian_jet(vp.Scene(robot), [angle], [0.0])
-            weight = pin.computeGeneralizedGravity(model, model.createData(), q)[model.joints[elbow].idx_v]
-            assert -jet.Lq[0] == pytest.approx(weight, rel=1e-12)
-            assert jet.Lvv[0, 0] == pytest.approx(full_crba(model, q)[-1, -1], rel=1e-12)
-
-    def test_takes_no_unnormalized_quaternion(self):
-        model = pin.Model()
-        base = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root")
-        model.addJoint(base, pin.JointModelRY(), pin.SE3.Identity(), "elbow")
-        for quaternion in ([0, 0, 0, 2], [0, 0, 0, 0]):
-            with refused(vp.InputError, "lock['root']", "1"):
-                vp.load_robot(model, lock={"root": [0, 0, 0, *quaternion]})
-        with refused(vp.InputError, "lock['root']", "7", "(1,)"):
-            vp.load_robot(model, lock={"root": 0.0})
+HALF = pin.Quaternion(np.array([0.1, 0.2, 0.3, 0.9])).normalized().coeffs()
 
 
-class TestMimic:
-    """Positions of all joints are worked out by hand and given to the naive Lagrangian."""
-
-    @staticmethod
-    def expected(robot: vp.Robot, place: dict[str, tuple[float, float]]) -> float:
-        """L with each joint at its (position, rate)."""
-        model = robot.model
-        positions, rates = np.array([place[name] for name in list(model.names)[1:]]).T
-        kinetic, potential = naive.energies(model, positions, rates, np.array([0.0, 0.0, -9.81]))
-        return float(kinetic - potential)
-
-    def check(self, robot: vp.Robot, q, v, place) -> None:
-        expected = self.expected(robot, place)
-        for backend in ("compiled", "pinocchio"):
-            jet = vp.lagrangian_jet(vp.Scene(robot), q, v, backend=backend)
-            assert pytest.approx(expected, rel=1e-12) == jet.L, backend
-        G = robot.velocity(np.eye(robot.dof))
-        M = G @ full_crba(robot.model, robot.configuration(q)) @ G.T
-        np.testing.assert_allclose(jet.Lvv, M, rtol=0, atol=1e-12 * np.abs(M).max())
-
-    @pytest.mark.parametrize("q", [0.7, 3.9, -12.0])
-    @pytest.mark.parametrize("axis", ["0 0 1", "0.6 0 0.8"])
-    @pytest.mark.parametrize("follower", MOVING)
-    @pytest.mark.parametrize("leader", MOVING)
-    def test_ties_joints_of_every_kind_however_far_they_turn(self, tmp_path, leader, follower, axis, q):
-        path = write_urdf(
-            tmp_path,
-            link("a"),
-            link("b"),
-            joint("j1", "base", "a", leader, axis),
-            joint("j2", "a", "b", follower, axis, mimic("j1", 2.5, 0.3)),
-        )
-        robot = vp.load_robot(path)
-        assert robot.joint_names == ("j1",)
-        self.check(robot, [q], [0.6], {"j1": (q, 0.6), "j2": (2.5 * q + 0.3, 1.5)})
-
-    def test_ratio_zero_holds_the_follower(self, tmp_path):
-        path = write_urdf(
-            tmp_path, link("a"), link("b"), joint("j1", "base", "a"), joint("j2", "a", "b", inside=mimic("j1", 0, 0.3))
-        )
-        self.check(vp.load_robot(path), [0.5], [2.0], {"j1": (0.5, 2.0), "j2": (0.3, 0.0)})
-        with refused(vp.RobotError, "'j2'", "'j1'", "multiplier", "0"):
-            vp.load_robot(pin.buildModelFromUrdf(str(path), mimic=True))
-
-    def test_leader_in_a_later_branch(self, tmp_path):
-        # Pinocchio orders siblings by name, so the leader comes last.
-        path = write_urdf(
-            tmp_path,
-            *(link(name) for name in ("a", "b", "c", "d")),
-            joint("j_a", "base", "a", inside=mimic("j_d", -2.0, 0.1)),
-            joint("j_b", "a", "b"),
-            joint("j_c", "base", "c"),
-            joint("j_d", "c", "d"),
-        )
-        robot = vp.load_robot(path)
-        assert robot.joint_names == ("j_b", "j_c", "j_d")
-        place = {"j_c": (0.2, 1.0), "j_d": (0.4, 2.0), "j_b": (0.6, 3.0), "j_a": (-0.7, -4.0)}
-        self.check(robot, [0.6, 0.2, 0.4], [3.0, 1.0, 2.0], place)
-        assert robot.velocity_limit.tolist() == [8.0, 8.0, 4.0]
-        assert robot.position_limits[0] == pytest.approx([-1.0, -1.0, -0.45])
-        assert robot.position_limits[1] == pytest.approx([1.0, 1.0, 0.55])
-        locked = vp.load_robot(path, lock={"j_b": 0.6})
-        assert_same_jet(jet_at(locked, [0.2, 0.4], [1.0, 2.0]), jet_at(robot, [0.6, 0.2, 0.4], [0.0, 1.0, 2.0]), [1, 2])
-        assert locked.velocity_limit.tolist() == [8.0, 4.0]
-
-    @pytest.mark.parametrize(
-        ("ratio", "offset", "limits", "speed", "effort"),
-        [(1, 0, (-0.5, 0.4), 2.0, 3.0), (-2, 0, (-0.2, 0.25), 1.0, 6.0), (0.5, 0.1, (-1.0, 0.6), 4.0, 1.5)],
-    )
-    def test_limits_of_followers_are_limits_of_their_leader(self, tmp_path, ratio, offset, limits, speed, effort):
-        tight = joint("j2", "a", "b", inside=mimic("j1", ratio, offset))
-        tight = tight.replace(
-            'effort="9" velocity="8" lower="-1" upper="1"', 'effort="3" velocity="2" lower="-0.5" upper="0.4"'
-        )
-        path = write_urdf(tmp_path, link("a"), link("b"), joint("j1", "base", "a"), tight)
-        robot = vp.load_robot(path)
-        assert (*robot.position_limits[0], *robot.position_limits[1]) == pytest.approx(limits)
-        assert (*robot.velocity_limit, *robot.effort_limit) == pytest.approx((speed, effort))
-        q = np.linspace(*limits, 5)[:, None]
-        follower = robot.configuration(q)[:, robot.model.getJointId("j2") - 1]
-        assert (follower >= -0.5 - 1e-12).all()
-        assert (follower <= 0.4 + 1e-12).all()
-        free = vp.load_robot(path, mimic="free")
-        assert free.position_limits[0].tolist() == [-1.0, -0.5]
-        assert vp.combine(robot, robot).position_limits[0] == pytest.approx([limits[0]] * 2)
-
-    def test_followers_without_room_are_told(self, tmp_path, caplog):
-        path = write_urdf(
-            tmp_path, link("a"), link("b"), joint("j1", "base", "a"), joint("j2", "a", "b", inside=mimic("j1", 1, 5))
-        )
-        assert vp.load_robot(path).position_limits[0].tolist() == [-1.0]
-        assert naming(caplog.messages, "'j2'", "no room")
-        assert naming(vp.inspect_robot(path).warnings, "'j2'", "no room")
-
-    def test_chain_of_mimics_ends_at_the_free_joint(self, tmp_path):
-        path = write_urdf(
-            tmp_path,
-            *(link(name) for name in ("a", "b", "c")),
-            joint("j1", "base", "a"),
-            joint("j2", "a", "b", inside=mimic("j1", 2, 0.5)),
-            joint("j3", "b", "c", inside=mimic("j2", -3, 0.25)),
-        )
-        place = {"j1": (0.3, 1.0), "j2": (1.1, 2.0), "j3": (-3.05, -6.0)}
-        self.check(vp.load_robot(path), [0.3], [1.0], place)
-
-    def test_of_a_leader_that_is_not_there_stays_free(self, tmp_path, caplog):
-        path = arm(tmp_path, inside=mimic("thumb"))
-        assert vp.load_robot(path).joint_names == ("j1",)
-        assert naming(caplog.messages, "'j1'", "'thumb'")
-
-    def test_free_makes_followers_coordinates(self, load):
-        robot = vp.load_robot("panda", mimic="free")
-        assert robot.joint_names[-2:] == ("panda_finger_joint1", "panda_finger_joint2")
-        tied = load("panda")
-        q, v = np.random.default_rng(0).normal(size=(2, 8))
-        G = np.vstack([np.eye(8), np.eye(8)[-1]])
-        free = jet_at(robot, G @ q, G @ v)
-        np.testing.assert_allclose(jet_at(tied, q, v).Lqq, G.T @ free.Lqq @ G, rtol=0, atol=1e-12)
-
-    def test_a_follower_that_carries_its_leader(self, tmp_path):
-        path = write_urdf(
-            tmp_path, link("a"), link("b"), joint("j1", "base", "a", inside=mimic("j2", 2)), joint("j2", "a", "b")
-        )
-        self.check(vp.load_robot(path), [0.3], [0.5], {"j1": (0.6, 1.0), "j2": (0.3, 0.5)})
+@pytest.mark.parametrize(
+    ("kind", "position"),
+    [
+        (pin.JointModelFreeFlyer(), [0.1, 0.2, 0.3, *HALF]),
+        (pin.JointModelSpherical(), HALF),
+        (pin.JointModelPlanar(), [0.4, 0.5, np.cos(0.6), np.sin(0.6)]),
+        (pin.JointModelHX(0.2), 1.3),
+        (pin.JointModelTranslation(), [1.0, 2.0, 3.0]),
+    ],
+    ids=lambda value: value.shortname() if hasattr(value, "shortname") else "",
+)
+def test_the_advice_against_an_unsupported_joint_works(kind, position):
+    rng, model, joint = np.random.default_rng(3), pin.Model(), 0
+    for name, each, x in (("root", kind, np.zeros(3)), ("elbow", pin.JointModelRY(), np.array([0.1, 0.2, 0.3]))):
+        joint = model.addJoint(joint, each, pin.SE3(np.eye(3), x), name)
+        model.appendBodyToJoint(joint, random_inertia(rng), pin.SE3.Identity())
+    with refused(vp.UnsupportedJoint, "'root'", kind.shortname(), "lock={'root': "):
+        vp.load_robot(model)
+    robot = vp.load_robot(model, lock={"root": position})
+    assert robot.joint_names == ("elbow",)
+    q, data = np.append(position, 0.0), model.createData()
+    for q[-1] in (0.3, -1.2):
+        jet = vp.lagrangian_jet(vp.Scene(robot), q[-1:], [0.0])
+        assert -jet.Lq[0] == pytest.approx(pin.computeGeneralizedGravity(model, data, q)[-1], rel=1e-12)
+        assert jet.Lvv[0, 0] == pytest.approx(pin.crba(model, data, q)[-1, -1], rel=1e-12)
+    if model.nq == 8:
+        for wrong, facts in (([0, 0, 0, 0, 0, 0, 2], "1"), (np.zeros(7), "1"), (0.0, ("7", "(1,)"))):
+            with refused(vp.InputError, "lock['root']", facts):
+                vp.load_robot(model, lock={"root": wrong})
 
 
-class TestJoints:
-    def test_limits_that_a_urdf_leaves_at_0_are_none(self, load):
-        robot = load("double_pendulum")
-        for entry in ET.parse(robot.urdf).getroot().findall("joint"):
-            if entry.get("name") in robot.joint_names:
-                assert {entry.find("limit").get(key) for key in ("lower", "upper", "velocity")} == {"0"}
-        lower, upper = robot.position_limits
-        assert (lower == -np.inf).all()
-        assert (upper == np.inf).all()
-        assert (robot.velocity_limit == np.inf).all()
-        held = robot.model.copy()
-        held.lowerPositionLimit[:], held.upperPositionLimit[:] = [0.0, 0.3], [0.5, 0.3]
-        lower, upper = vp.load_robot(held).position_limits
-        np.testing.assert_array_equal([lower, upper], [[0.0, 0.3], [0.5, 0.3]])
+def tree(folder, *joints, axis="0 1 0"):
+    """The file of joints in words (name, parent, child, kind), each with what it follows."""
+    parts = [link(words.split()[2]) + joint(*words.split(), axis=axis, inside=inside) for words, inside in joints]
+    return write_urdf(folder, *parts)
 
-    def test_a_composite_of_one_joint_is_that_joint_unless_displaced(self):
-        def of(placement: pin.SE3) -> pin.Model:
-            model = pin.Model()
-            k = model.addJoint(0, pin.JointModelComposite(pin.JointModelRY(), placement), pin.SE3.Identity(), "shell")
-            model.appendBodyToJoint(k, random_inertia(np.random.default_rng(0)), pin.SE3.Identity())
-            return model
 
-        robot = vp.load_robot(of(pin.SE3.Identity()))
-        scene = vp.Scene(robot)
-        jets = [vp.lagrangian_jet(scene, [0.4], [1.3], backend=b) for b in ("compiled", "pinocchio")]
-        assert pytest.approx(jets[1].L, rel=1e-13) == jets[0].L
+def check(robot, place):
+    """The Lagrangian with each joint at its (position, rate), worked out by hand, and M as Pinocchio's model has it."""
+    positions, rates = np.array([place[name] for name in list(robot.model.names)[1:]]).T
+    q, v = np.array([place[name] for name in robot.joint_names]).T
+    kinetic, potential = naive.energies(robot.model, positions, rates, np.array([0.0, 0.0, -9.81]))
+    for backend in ("compiled", "pinocchio"):
+        jet = vp.lagrangian_jet(vp.Scene(robot), q, v, backend=backend)
+        assert pytest.approx(kinetic - potential, rel=1e-12) == jet.L, backend
+    M = mass_matrix(robot, q, robot.model.createData())
+    np.testing.assert_allclose(jet.Lvv, M, rtol=0, atol=1e-12 * np.abs(M).max())
+
+
+@pytest.mark.parametrize("q", [0.7, 3.9, -12.0])
+@pytest.mark.parametrize("axis", ["0 0 1", "0.6 0 0.8"])
+@pytest.mark.parametrize("follower", MOVING)
+@pytest.mark.parametrize("leader", MOVING)
+def test_ties_joints_of_every_kind_however_far_they_turn(tmp_path, leader, follower, axis, q):
+    joints = (f"j1 base a {leader}", ""), (f"j2 a b {follower}", mimic("j1", 2.5, 0.3))
+    robot = vp.load_robot(tree(tmp_path, *joints, axis=axis))
+    assert robot.joint_names == ("j1",)
+    check(robot, {"j1": (q, 0.6), "j2": (2.5 * q + 0.3, 1.5)})
+
+
+@pytest.mark.parametrize(
+    ("joints", "place"),
+    [
+        ((("j1 base a", ""), ("j2 a b", mimic("j1", 0, 0.3))), {"j1": (0.5, 2.0), "j2": (0.3, 0.0)}),
+        # A chain of followers ends at the free joint.
+        (
+            (("j1 base a", ""), ("j2 a b", mimic("j1", 2, 0.5)), ("j3 b c", mimic("j2", -3, 0.25))),
+            {"j1": (0.3, 1.0), "j2": (1.1, 2.0), "j3": (-3.05, -6.0)},
+        ),
+        # A follower carries its leader.
+        ((("j1 base a", mimic("j2", 2)), ("j2 a b", "")), {"j1": (0.6, 1.0), "j2": (0.3, 0.5)}),
+    ],
+    ids=["ratio zero", "chain", "carried"],
+)
+def test_ties_in_any_order(tmp_path, joints, place):
+    path = tree(tmp_path, *joints)
+    check(vp.load_robot(path), place)
+    free = vp.load_robot(path, mimic="free")
+    assert free.dof == len(place)
+    check(free, place)
+
+
+def test_a_model_s_ratio_of_zero_is_refused(tmp_path):
+    path = tree(tmp_path, ("j1 base a", ""), ("j2 a b", mimic("j1", 0, 0.3)))
+    with refused(vp.RobotError, "'j2'", "'j1'", "multiplier", "0"):
+        vp.load_robot(pin.buildModelFromUrdf(str(path), mimic=True))
+
+
+def test_a_leader_in_a_later_branch(tmp_path):
+    # Pinocchio orders siblings by name, so the leader comes last.
+    joints = ("j_a base a", mimic("j_d", -2.0, 0.1)), ("j_b a b", ""), ("j_c base c", ""), ("j_d c d", "")
+    path = tree(tmp_path, *joints)
+    robot = vp.load_robot(path)
+    assert robot.joint_names == ("j_b", "j_c", "j_d")
+    check(robot, {"j_c": (0.2, 1.0), "j_d": (0.4, 2.0), "j_b": (0.6, 3.0), "j_a": (-0.7, -4.0)})
+    assert robot.velocity_limit.tolist() == [8.0, 8.0, 4.0]
+    assert np.ravel(robot.position_limits) == pytest.approx([-1.0, -1.0, -0.45, 1.0, 1.0, 0.55])
+    locked = vp.load_robot(path, lock={"j_b": 0.6})
+    assert_same_jet(jet_at(locked, [0.2, 0.4], [1.0, 2.0]), jet_at(robot, [0.6, 0.2, 0.4], [0.0, 1.0, 2.0]), [1, 2])
+    assert locked.velocity_limit.tolist() == [8.0, 4.0]
+
+
+@pytest.mark.parametrize(
+    ("ratio", "offset", "limits", "speed", "effort"),
+    [(1, 0, (-0.5, 0.4), 2.0, 3.0), (-2, 0, (-0.2, 0.25), 1.0, 6.0), (0.5, 0.1, (-1.0, 0.6), 4.0, 1.5)],
+)
+def test_limits_of_followers_are_limits_of_their_leader(tmp_path, ratio, offset, limits, speed, effort):
+    tight = joint("j2", "a", "b", inside=mimic("j1", ratio, offset))
+    for usual, own in (("9", "3"), ("8", "2"), ("-1", "-0.5"), ("1", "0.4")):
+        tight = tight.replace(f'="{usual}"', f'="{own}"', 1)
+    path = write_urdf(tmp_path, link("a"), link("b"), joint("j1", "base", "a"), tight)
+    robot = vp.load_robot(path)
+    assert (*robot.position_limits[0], *robot.position_limits[1]) == pytest.approx(limits)
+    assert (*robot.velocity_limit, *robot.effort_limit) == pytest.approx((speed, effort))
+    q = np.linspace(*limits, 5)[:, None]
+    follower = robot.configuration(q)[:, robot.model.getJointId("j2") - 1]
+    assert (follower >= -0.5 - 1e-12).all()
+    assert (follower <= 0.4 + 1e-12).all()
+    free = vp.load_robot(path, mimic="free")
+    assert free.position_limits[0].tolist() == [-1.0, -0.5]
+    assert vp.combine(robot, robot).position_limits[0] == pytest.approx([limits[0]] * 2)
+
+
+def test_followers_without_room_are_told(tmp_path, caplog):
+    path = tree(tmp_path, ("j1 base a", ""), ("j2 a b", mimic("j1", 1, 5)))
+    assert vp.load_robot(path).position_limits[0].tolist() == [-1.0]
+    assert naming(caplog.messages, "'j2'", "no room")
+    assert naming(vp.inspect_robot(path).warnings, "'j2'", "no room")
+
+
+def test_of_a_leader_that_is_not_there_stays_free(tmp_path, caplog):
+    path = arm(tmp_path, inside=mimic("thumb"))
+    assert vp.load_robot(path).joint_names == ("j1",)
+    assert naming(caplog.messages, "'j1'", "'thumb'")
+
+
+def test_limits_of_zero_are_none_in_a_file_alone(load):
+    robot = load("double_pendulum")
+    assert not robot.model.upperPositionLimit.any()
+    assert robot.position_limits[1].tolist() == robot.velocity_limit.tolist() == [np.inf, np.inf]
+    held = robot.model.copy()
+    held.lowerPositionLimit[:], held.upperPositionLimit[:] = [0.0, 0.3], [0.5, 0.3]
+    np.testing.assert_array_equal(vp.load_robot(held).position_limits, [[0.0, 0.3], [0.5, 0.3]])
+
+
+@pytest.mark.parametrize("x", [0.0, 0.1])
+def test_a_composite_of_one_joint_is_that_joint_unless_displaced(x):
+    model, shell = pin.Model(), pin.JointModelComposite(pin.JointModelRY(), pin.SE3(np.eye(3), np.array([x, 0, 0])))
+    model.addJoint(0, shell, pin.SE3.Identity(), "shell")
+    model.appendBodyToJoint(1, random_inertia(np.random.default_rng(0)), pin.SE3.Identity())
+    if x:
         with refused(vp.UnsupportedJoint, "'shell'", "JointModelComposite"):
-            vp.load_robot(of(pin.SE3(np.eye(3), np.array([0.1, 0.0, 0.0]))))
-
-
-def test_the_arm_of_talos_has_the_rotors_of_its_srdf(load):
-    robot = load("talos_arm")
-    model = pin.buildModelFromUrdf(str(robot.urdf))
-    pin.loadRotorParameters(model, str(example_robot_data.robots_dir() / example_robot_data.SRDF["talos_arm"]), False)
-    assert model.armature.any()
-    np.testing.assert_allclose(robot.tree.armature, model.armature, rtol=1e-15)
+            vp.load_robot(model)
+        return
+    scene = vp.Scene(vp.load_robot(model))
+    jets = [vp.lagrangian_jet(scene, [0.4], [1.3], backend=name) for name in ("compiled", "pinocchio")]
+    assert pytest.approx(jets[1].L, rel=1e-13) == jets[0].L
 
 
 def test_planar_chain_is_rods_in_the_vertical_plane():
@@ -479,24 +388,18 @@ def test_planar_chain_is_rods_in_the_vertical_plane():
     kinetic = 0.5 * mass * (speeds**2).sum() + 0.5 * mass * length**2 / 12 * (rates**2).sum()
     potential = mass * 9.81 * centers[:, 1].sum()
     assert pytest.approx(kinetic - potential, rel=1e-14) == vp.lagrangian_jet(scene, q, v).L
+    assert scene.robot.end_effector == "tip"
+    np.testing.assert_allclose(scene.robot.frame_positions(q), [tips[-1, 0], 0.0, tips[-1, 1]], atol=1e-14)
 
 
-def test_end_effector_is_where_pinocchio_says(load):
-    rng = np.random.default_rng(0)
-    chain = vp.planar_chain(3)
-    assert chain.end_effector == "tip"
-    q = rng.normal(size=(4, 3))
-    angles = np.cumsum(q, axis=1)
-    expected = np.stack([np.cos(angles).sum(axis=1), np.zeros(4), -np.sin(angles).sum(axis=1)], axis=1)
-    np.testing.assert_allclose(chain.frame_positions(q), expected, atol=1e-14)
+def test_frames_are_where_pinocchio_says(load):
     panda = load("panda")
-    q = rng.normal(size=(2, panda.dof))
-    data = panda.model.createData()
-    for row, position in zip(q, panda.frame_positions(q, "panda_hand"), strict=True):
-        pin.framesForwardKinematics(panda.model, data, panda.configuration(row))
-        np.testing.assert_allclose(position, data.oMf[panda.model.getFrameId("panda_hand")].translation, atol=1e-14)
+    q = np.random.default_rng(0).normal(size=(2, panda.dof))
+    found = panda.frame_positions(q, "panda_hand")
+    expected = [place.translation for place in placements(panda, q, "panda_hand")]
+    np.testing.assert_allclose(found, expected, atol=1e-14)
+    np.testing.assert_array_equal(panda.frame_positions(q[0], "panda_hand"), found[0])
     with refused(vp.UnknownFrame, "'panda'", "'hand'", "'panda_hand'"):
         panda.frame_positions(q, "hand")
-    np.testing.assert_array_equal(panda.frame_positions(q[0], "panda_hand"), panda.frame_positions(q, "panda_hand")[0])
-    with refused(vp.InputError, "q", "(N, 3)", "(3,)", "(2,)"):
-        chain.frame_positions(np.zeros(2))
+    with refused(vp.InputError, "q", "(N, 8)", "(8,)", "(2,)"):
+        panda.frame_positions(np.zeros(2))

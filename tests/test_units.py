@@ -1,40 +1,197 @@
-"""Units in messages: those of the joints that they are about, and both only where joints turn and slide."""
+"""What is said of joint values: limits that are passed, degrees and millimetres, each in the units of its joints."""
 
 from __future__ import annotations
 
 import numpy as np
+import pinocchio as pin
 import pytest
-from mechanisms import joint, link, slider, write_urdf
+from findings import about
+from refusals import naming, refused, unnamed
 
 import varpin as vp
-from varpin.model import joint_unit
+from varpin.cli import main
+from varpin.control.checks import foreseen
+
+HOME = np.array([0.0, -90.0, 90.0, 0.0, 45.0, 0.0])
+FACTS = ("'shoulder_lift_joint'", "-90 rad", "14 turns", "looks like degrees", "np.deg2rad")
+REST = np.zeros(6)
+SHORT = {"dt": 1e-3, "steps": 2}
+SLIDE, TURN, WHEEL = pin.JointModelPX(), pin.JointModelRY(), pin.JointModelRUBY()
 
 
-@pytest.fixture
-def crane(tmp_path):
-    """A robot with a revolute and a prismatic joint."""
-    parts = link("l1"), joint("turns", "base", "l1"), link("l2"), joint("slides", "l1", "l2", kind="prismatic")
-    return vp.load_robot(write_urdf(tmp_path, *parts))
+def arm(*joints, lower=-9.0, upper=9.0):
+    """Rods of 1 m on joints, with limits of 9 N m and 9 rad/s beside those of the positions."""
+    model, place = pin.Model(), 0
+    sides = np.array([9.0]), np.array([9.0]), np.array([lower]), np.array([upper])
+    for k, kind in enumerate(joints):
+        limits = () if kind == WHEEL else sides
+        place = model.addJoint(place, kind, pin.SE3.Identity(), f"joint{k + 1}", *limits)
+        rod = pin.Inertia(1.0, np.array([0.5, 0.0, 0.0]), np.diag([0.001, 0.083, 0.083]))
+        model.appendBodyToJoint(place, rod, pin.SE3.Identity())
+    return vp.load_robot(model)
 
 
-def test_joint_unit(crane):
-    assert (joint_unit(vp.planar_chain(2)), joint_unit(vp.planar_chain(2), speed=True)) == ("rad", "rad/s")
-    assert (joint_unit(slider()), joint_unit(slider(), speed=True)) == ("m", "m/s")
-    assert (joint_unit(crane), joint_unit(crane, speed=True)) == ("rad or m", "rad/s or m/s")
-    assert [joint_unit(crane, c) for c in (0, 1, [1], [0, 1])] == ["rad", "m", "m", "rad or m"]
+@pytest.fixture(scope="module")
+def scene():
+    return vp.Scene(vp.load_robot("ur5"), gravity=False)
 
 
-def bound(robot, constraint):
-    n = robot.dof
-    problem = vp.OptimalControlProblem(
-        vp.Scene(robot), vp.ControlCost(1.0), np.zeros(n), np.zeros(n), dt=0.01, steps=2, constraints=[constraint]
+def moved(scene, q0=REST, v0=REST, **options):
+    return vp.simulate(scene, q0, v0, **SHORT | options).warnings
+
+
+def planned(scene, q0, v0, *constraints):
+    given = {"dt": 0.05, "steps": 2, "constraints": constraints}
+    return foreseen(vp.OptimalControlProblem(scene, vp.ControlCost(1e-3), q0, v0, **given))
+
+
+CRANE, CHAIN = arm(TURN, SLIDE), arm(TURN, TURN)
+
+
+@pytest.mark.parametrize(
+    ("constraint", "unit"),
+    [
+        (vp.WithinVelocityLimits(CHAIN, (-1.0, 1.0)), "rad/s"),
+        (vp.WithinVelocityLimits(CRANE, (-1.0, 1.0)), "rad/s or m/s"),
+        # Only joints with a limit count.
+        (vp.WithinJointLimits(CRANE, (-np.inf, [np.inf, 1.0])), "m"),
+        (vp.WithinJointLimits(CRANE, (-np.inf, 1.0)), "rad or m"),
+    ],
+)
+def test_limits_are_in_the_units_of_their_joints(constraint, unit):
+    (told,) = about(
+        planned(vp.Scene(constraint.robot), [2.0, 2.0], [2.0, 2.0], constraint), "start outside constraints"
     )
-    return problem.bound_constraints[0]
+    assert told.unit == unit
+    assert not unnamed(told, unit)
 
 
-def test_units_of_limits(crane):
-    chain = vp.planar_chain(2)
-    assert bound(chain, vp.WithinVelocityLimits(chain, (-1.0, 1.0))).unit == "rad/s"
-    assert bound(crane, vp.WithinVelocityLimits(crane, (-1.0, 1.0))).unit == "rad/s or m/s"
-    # Only joints with a limit count.
-    assert bound(crane, vp.WithinJointLimits(crane, (-np.inf, [np.inf, 1.0]))).unit == "m"
+@pytest.mark.parametrize(
+    ("kind", "sides", "q", "v", "pull", "kinds"),
+    [
+        (WHEEL, (), 0.0, 50.0, 500.0, set()),
+        (TURN, (0.0, 0.0), 0.0, 5.0, 0.0, set()),
+        (TURN, (1.0, -1.0), 0.0, 5.0, 0.0, set()),
+        (TURN, (-0.5, 1.0), 1.0 + 1e-9, 0.0, 0.0, set()),
+        (TURN, (-0.5, 1.0), 0.0, 0.0, 9.0, set()),
+        (TURN, (-0.5, 1.0), -0.45, -5.0, 0.0, {"position limits"}),
+        (TURN, (-0.5, 1.0), 0.0, 10.0, 10.0, {"velocity limits", "effort limits"}),
+        (TURN, (-0.5, 1.0), 1.1, 10.0, 10.0, {"position limits", "velocity limits", "effort limits"}),
+    ],
+    ids=["none", "zeros", "the wrong way round", "rounding", "a motor at its limit", "lower", "two", "three"],
+)
+def test_limits_that_are_passed_are_told_and_counted(kind, sides, q, v, pull, kinds):
+    scene = vp.Scene(arm(kind, **dict(zip(("lower", "upper"), sides, strict=False))), gravity=False)
+    motion = vp.simulate(scene, [q], [v], dt=1e-3, steps=20, controls=[pull])
+    assert {told.kind for told in motion.warnings} == kinds
+    count = {0: ")", 1: ", 1 warning)"}.get(len(kinds), f", {len(kinds)} warnings)")
+    assert repr(motion).endswith(count)
+    assert ("warning" in repr(motion)) == bool(kinds)
+
+
+def test_forces_beyond_effort_limits_are_told_of_by_what_reaches_the_joint():
+    # One control pulls at both joints: a gear of 3 and one of -1/2.
+    scene = vp.Scene(arm(SLIDE, TURN), gravity=False, actuation=[[3.0], [-0.5]])
+    pull = np.linspace(0.0, 4.0, 50)[:, None]
+    (told,) = moved(scene, np.zeros(2), np.zeros(2), steps=50, controls=pull)
+    assert (told.kind, told.joint, told.unit) == ("effort limits", "joint1", "N")
+    assert told.value == pytest.approx(3.0)
+    assert told.time == pytest.approx(0.049)
+    assert not unnamed(told, "'joint1'", "9 N", "by 3", "t = 0.049 s")
+
+
+def test_plans_ensembles_and_controllers_tell_of_all_limits():
+    scene = vp.Scene(arm(TURN), gravity=False)
+    cost = vp.ControlCost(1e-6) + vp.Terminal(vp.TrackingCost([2.0], 1e3) + vp.VelocityCost(1.0))
+    problem = vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=1e-2, steps=20)
+    plan, run = vp.solve(problem), vp.Mpc(problem).run(duration=0.05)
+    ensemble = vp.simulate_ensemble(scene, [0.0], [20.0], dt=1e-3, steps=9, paths=2, rng=0, controls=[50.0])
+    for told in (plan.warnings, run.warnings, ensemble.warnings):
+        for kind in ("velocity limits", "effort limits"):
+            assert about(told, kind), told
+
+
+def test_a_start_in_degrees(scene, capsys):
+    assert not unnamed(moved(scene, HOME)[0], FACTS)
+    assert not naming(moved(scene, np.deg2rad(HOME)), "degrees")
+    ensemble = vp.simulate_ensemble(scene, HOME, REST, **SHORT, paths=2, rng=0, workers=1)
+    assert not unnamed(ensemble.warnings[0], FACTS)
+    assert main(["simulate", "ur5", "--steps", "2", "--q0", *map(str, HOME)]) == 0
+    assert not unnamed(" ".join(capsys.readouterr().err.split()), FACTS)
+
+
+@pytest.mark.parametrize(
+    ("speed", "told"), [(90.0, True), (-22.5, True), (22.51234, False), (3.1, False), (12.5, False)]
+)
+def test_a_speed_beyond_its_limit_in_degrees(scene, speed, told):
+    v0 = speed * np.eye(6)[1]
+    found = naming(moved(scene, v0=v0, dt=1e-4), "looks like degrees")
+    assert [not unnamed(text, "v0", "'shoulder_lift_joint'", f"{speed:g} rad/s") for text in found] == [True] * told
+    free = scene.robot.model.copy()
+    free.velocityLimit = np.full(6, np.inf)
+    assert not naming(moved(vp.Scene(vp.load_robot(free)), v0=v0, dt=1e-4), "looks like degrees")
+
+
+def test_positions_for_servos_in_degrees(scene):
+    servos = vp.Scene(scene.robot, gravity=False, damping=1.0, forces=[vp.PositionServo(100.0, 10.0)])
+    for controls in (HOME, lambda t, q, v: HOME):
+        assert not unnamed(moved(servos, controls=controls)[0], ("controls", *FACTS))
+    assert not naming(moved(scene, controls=HOME), "degrees")
+    assert not naming(moved(servos, controls=np.deg2rad(HOME)), "degrees")
+    assert len(naming(moved(servos, HOME), "degrees")) == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "q", "told"),
+    [
+        (WHEEL, 90.0, True),
+        (WHEEL, -22.5, True),
+        (WHEEL, 12.5, False),
+        (WHEEL, 33.3333333, False),
+        (WHEEL, 1e3 / 7.0, False),
+        (SLIDE, 90.0, False),
+    ],
+)
+def test_joints_without_limits_may_have_turned_many_times(kind, q, told):
+    """A wheel that has turned is no mistake; a number of one decimal is typed."""
+    wheel = vp.Scene(arm(kind, lower=-np.inf, upper=np.inf), gravity=False)
+    assert bool(naming(moved(wheel, [q], [0.0]), "degrees")) == told
+
+
+def test_other_positions_in_degrees(scene, caplog):
+    vp.load_robot("ur5", lock={"elbow_joint": 90})
+    vp.Scene(scene.robot, stiffness=1.0, rest=HOME)
+    elbow, rest = caplog.messages
+    assert not unnamed(elbow, ("elbow_joint", "90", "looks like degrees", "np.deg2rad"))
+    assert not unnamed(rest, ("rest", *FACTS))
+    with refused(vp.InputError, "q0", *FACTS):
+        moved(vp.Scene(scene.robot, constraints=[vp.PointOnPoint("tool0", [0.8, 0.1, 0.2])]), HOME)
+
+
+def test_stops_in_degrees(caplog):
+    robot = vp.load_robot("so100")
+    vp.Scene(robot, forces=[vp.JointStop(1e3, 5.0), vp.JointStop(1e3, lower=-1.5, upper={"shoulder_lift": 1.5})])
+    assert not caplog.records
+    vp.Scene(robot, forces=[vp.JointStop(1e3, 5.0, lower=-90.0, upper=90.0)])
+    assert [told.partition(" of the JointStop")[0] for told in caplog.messages] == ["lower", "upper"]
+    assert naming(caplog.messages, "looks like degrees") == caplog.messages
+
+
+def ball(r, at, distance):
+    return vp.KeepClear(r, [vp.Obstacle.sphere(at, 0.1, "ball")], distance, links=["forearm_link"])
+
+
+@pytest.mark.parametrize("scale", [1000.0, 1.0])
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda r, k: ball(r, k * np.array([0.9, 0.5, 0.4]), 0.0), "'ball'"),
+        (lambda r, k: ball(r, [2.0, 0.5, 0.4], k * 0.1), "KeepClear: distance"),
+        (lambda r, k: vp.KeepOutOfSphere(r, "tool0", k * np.array([0.9, 0.3, 0.4]), 0.1), "KeepOutOfSphere"),
+        (lambda r, k: vp.KeepInHalfSpace(r, "tool0", [0.0, 0.0, 1.0], k * -0.3), "KeepInHalfSpace: offset"),
+    ],
+)
+def test_millimetres_in_obstacles_and_regions(scene, make, named, scale):
+    told = naming(planned(scene, np.deg2rad(HOME), REST, make(scene.robot, scale)), "millimetres")
+    assert told == naming(told, named)
+    assert bool(told) == (scale > 1.0)
