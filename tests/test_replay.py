@@ -303,6 +303,8 @@ def test_refuses_what_it_cannot_show(finger, motion, tmp_path):
     q[1, 2] = np.nan
     no("motion[1, 2]", "nan", motion=q, dt=0.1)
     no("speed", "0", speed=0)
+    for size in ((-1, 3), (700,), 700, ("a", "b")):
+        no("size", html=None, size=size)
     no("fps", "-1", fps=-1)
     no("ghost", "(K, 3)", "(3, 2)", marks=vp.Marks(ghost=np.zeros((3, 2))))
     no("ghost", "(K, 3)", "(3,)", marks=vp.Marks(ghost=np.zeros(3)))
