@@ -151,11 +151,11 @@ def test_paths_that_were_finished_before_a_worker_was_lost_are_kept():
     scene, q0 = vp.Scene(vp.planar_chain(1), forces=[vp.CustomForce(deadly)]), np.linspace(-1.0, 0.0, 300)[:, None]
     q0[-1] = 2.1
     with ProcessPoolExecutor(1) as pool, refused(vp.WorkersLost, "lost", ".ensemble") as caught:
-        vp.simulate_ensemble(scene, q0, [0.0], paths=300, rng=0, dt=0.01, steps=20, executor=pool)
+        vp.simulate_ensemble(scene, q0, [0.0], paths=300, rng=0, dt=0.01, steps=4, executor=pool)
     assert isinstance(caught.value.__cause__, BrokenProcessPool)
     kept = caught.value.ensemble
     assert 100 < len(kept.q) < 300
-    motion = vp.simulate(scene, q0[7], [0.0], dt=0.01, steps=20, check=False)
+    motion = vp.simulate(scene, q0[7], [0.0], dt=0.01, steps=4, check=False)
     assert kept.q[7].tobytes() == motion.q.tobytes()
     assert pickle.loads(pickle.dumps(caught.value)).ensemble.q.shape == kept.q.shape
 
