@@ -23,6 +23,7 @@ from varpin.study.checks import LEVELS
 from varpin.study.extremes import INTEGRATORS, Kind
 
 BY_NAME = {trial.name: trial for trial in TRIALS}
+assert len(BY_NAME) == len(TRIALS)
 
 
 def made_up(scene, v0, dt=1e-2, steps=100, window=1.0, **options):
@@ -134,15 +135,6 @@ def test_the_exact_motion_is_exact(name):
     np.testing.assert_allclose(own.exact().q, integrated.exact().q, rtol=0, atol=1e-9)
 
 
-def test_the_error_of_a_period_is_that_of_its_closed_form():
-    """An oscillator: what the explicit Euler method's amplitude gains over a period, in units of what is wrong."""
-    scene, z = vp.Scene(rod_chain([1.0], [1.0]), gravity=False, stiffness=1.0 / 3.0), 0.1
-    for integrator in (vp.ExplicitEuler(), vp.Midpoint()):
-        motion = vp.simulate(scene, [0.5], [0.0], dt=z, steps=round(math.tau / z), integrator=integrator)
-        off = np.abs(motion.q[:, 0] - 0.5 * np.cos(motion.t)).max() / np.ptp(motion.q)
-        assert period_error(scene, integrator, motion) == pytest.approx(off / LEVELS["error"], rel=0.3)
-
-
 def test_what_goes_wrong_late_is_found():
     """A fifth of its travel is added to the rest of a motion from a node on, and every record is consistent."""
     own, motion = falling(steps=400)
@@ -226,13 +218,6 @@ def test_motions_that_end_early_are_judged_by_what_there_is(hasty):
 
 
 # --- the record ----------------------------------------------------------------------------------------------------
-
-
-def test_every_trial_has_a_name_of_its_own(load):
-    for trials in (TRIALS, battery.trials_on(load("finger"))):
-        names = [trial.name for trial in trials]
-        assert len(set(names)) == len(names)
-    assert len({repr(member) for member in INTEGRATORS}) == len(INTEGRATORS) == 11
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import re
 import subprocess
 import sys
 
@@ -40,35 +41,25 @@ def legend_of(owner):
 
 
 @pytest.mark.parametrize(("label", "draw"), SINGLE.items())
-def test_single_figures_have_units_and_return_figure_and_axes(label, draw):
-    _, trajectory = swing()
-    figure, axes = draw(trajectory)
+def test_single_figures_have_units_and_lines_under_the_joints_names(label, draw):
+    robot, motion = swing()
+    values = (motion.q, motion.v, np.vstack([motion.u, motion.u[-1:]]), motion.energy[:, None] - motion.energy[0])
+    data = dict(zip(SINGLE, values, strict=True))[label]
+    named = {"robot": robot} if len(data.T) > 1 else {}
+    figure, axes = draw(motion, **named)
     assert axes.figure is figure
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("time [s]", label)
-    assert axes.get_xlim() == (0.0, trajectory.t[-1])
+    assert (axes.get_xlabel(), axes.get_xlim()) == ("time [s]", (0.0, motion.t[-1]))
+    assert axes.get_ylabel() == (re.sub(r" or (m|N)\b[^\]]*", "", label) if named else label)
+    names = list(motion.joint_names) if named else ["energy"]
+    assert list(drawn(axes)) == names
+    assert legend_of(axes) == (names if named else [])
+    for line, column in zip(drawn(axes).values(), data.T, strict=True):
+        np.testing.assert_array_equal(line.get_xydata(), np.column_stack([motion.t, column]))
     mine = Figure()
     given = mine.subplots()
-    assert draw(trajectory, axes=given) == (mine, given)
+    assert draw(motion, axes=given) == (mine, given)
+    assert given.get_ylabel() == label
     assert given.lines
-
-
-@pytest.mark.parametrize(
-    ("draw", "values", "label"),
-    [
-        (plots.plot_joints, lambda motion: motion.q, "position [rad]"),
-        (plots.plot_velocities, lambda motion: motion.v, "velocity [rad/s]"),
-        (plots.plot_energy_error, lambda motion: (motion.energy - motion.energy[0])[:, None], "E(t) - E(0) [J]"),
-    ],
-)
-def test_lines_hold_the_data_under_the_joints_names(draw, values, label):
-    robot, trajectory = swing()
-    _, axes = draw(trajectory, robot=robot) if "energy" not in draw.__name__ else draw(trajectory)
-    names = list(trajectory.joint_names) if draw is not plots.plot_energy_error else ["energy"]
-    assert list(drawn(axes)) == names
-    assert legend_of(axes) == (names if len(names) > 1 else [])
-    assert axes.get_ylabel() == label
-    for line, column in zip(drawn(axes).values(), values(trajectory).T, strict=True):
-        np.testing.assert_array_equal(line.get_xydata(), np.column_stack([trajectory.t, column]))
 
 
 def test_prismatic_joints_are_in_metres_and_mixed_ones_say_which():

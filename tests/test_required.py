@@ -43,8 +43,8 @@ def hand(folder, moving, *, gravity="false", q='"joint_5.0" = 0.4, "joint_12.0" 
     return path
 
 
-def columns(file, names):
-    return [file.robot.joint_names.index(name) for name in names]
+def columns(robot, names):
+    return [robot.joint_names.index(name) for name in names]
 
 
 def test_idle_fingers_are_left_out_and_the_answer_is_the_same(tmp_path):
@@ -57,12 +57,13 @@ def test_idle_fingers_are_left_out_and_the_answer_is_the_same(tmp_path):
     assert file.robot.tree.parent.size == 4  # nothing of the other fingers is in the tree
     plan = file.solve()
     everything = vp.solve(whole.problem)
-    own = columns(whole, INDEX)
+    own = columns(whole.robot, INDEX)
     np.testing.assert_allclose(plan.trajectory.q, everything.trajectory.q[:, own], atol=1e-10)
     np.testing.assert_allclose(plan.controls, everything.controls[:, own], atol=1e-9)
     assert plan.cost == pytest.approx(everything.cost, rel=1e-9)
     others = [c for c in range(16) if c not in own]
     assert np.ptp(everything.trajectory.q[:, others], axis=0).max() < 1e-12
+    assert vp.load_scene(hand(tmp_path, ["joint_1.0", "joint_13.0"])).required.parts == (INDEX, THUMB)
 
 
 @pytest.mark.parametrize(
@@ -83,11 +84,6 @@ def test_idle_fingers_are_left_out_and_the_answer_is_the_same(tmp_path):
 def test_what_touches_a_finger(change, joints, tmp_path):
     file = vp.load_scene(hand(tmp_path, ["joint_1.0"], **change))
     assert file.robot.dof == joints
-
-
-def test_fingers_are_independent(tmp_path):
-    file = vp.load_scene(hand(tmp_path, ["joint_1.0", "joint_13.0"]))
-    assert file.required.parts == (INDEX, THUMB)
 
 
 def test_payload_is_what_pinocchio_makes_of_it(load):
@@ -145,23 +141,21 @@ def test_scenes_in_python_are_the_same_without_idle_joints():
         vp.ControlNoise(1e-2 * np.eye(16)[:, [1], None] * np.eye(16)[0]),
     ]
     q0 = {"joint_9.0": 0.2, "joint_12.0": 0.3}
-    scene = vp.Scene(
-        robot, gravity=False, damping=1e-3, forces=every_force(robot)[:1] + every_force(robot)[2:], noise=noise
-    )
+    spring, _, *others = every_force(robot)
+    scene = vp.Scene(robot, gravity=False, damping=1e-3, forces=[spring, *others], noise=noise)
     required = scene.required(q0)
     part = scene.without(required.idle)
     # The index finger has a spring, the middle finger a damper to it.
-    assert part.robot.joint_names == tuple(f"joint_{k}.0" for k in range(8))
-    assert required.joints == part.robot.joint_names
+    assert part.robot.joint_names == required.joints == tuple(f"joint_{k}.0" for k in range(8))
     assert required.parts == (required.joints,)
     assert required.idle.keys() == {f"joint_{k}.0" for k in range(8, 16)}
     assert required.idle["joint_12.0"] == 0.3
     assert dict(part.robot.locked) == dict(required.idle)
     assert part.processes == scene.processes == 2
     assert len(part.couplings) == 1
-    own = [robot.joint_names.index(name) for name in part.robot.joint_names]
+    own = columns(robot, part.robot.joint_names)
     start = np.zeros(16)
-    start[[robot.joint_names.index(name) for name in q0]] = list(q0.values())
+    start[columns(robot, q0)] = list(q0.values())
     options = {"dt": 1e-3, "steps": 40, "rng": 0, "check": False}
     whole = vp.simulate(scene, start, np.zeros(16), controls=0.01 * np.eye(16)[0], **options)
     alone = vp.simulate(part, start[own], np.zeros(8), controls=0.01 * np.eye(8)[0], **options)
@@ -179,7 +173,7 @@ def test_servos_hold_idle_joints_and_move_the_others():
     assert len(required.joints) == 12
     part = scene.without(required.idle)
     assert part.servo_joints == required.joints
-    own = [robot.joint_names.index(name) for name in part.robot.joint_names]
+    own = columns(robot, part.robot.joint_names)
     whole = vp.simulate(scene, q0, q0, dt=1e-3, steps=40, controls=command, check=False)
     alone = vp.simulate(part, q0[own], q0[own], dt=1e-3, steps=40, controls=command[own], check=False)
     np.testing.assert_allclose(alone.q, whole.q[:, own], rtol=1e-11, atol=1e-13)
