@@ -1,6 +1,5 @@
 """The ``varpin`` command: what it prints, writes and returns."""
 
-import contextlib
 import io
 import logging
 import re
@@ -266,18 +265,6 @@ def test_failed_step_keeps_what_was_before_it(arm, tmp_path, run, monkeypatch):
     assert not unnamed(line, "varpin: error", "step 7", "t = 0.007 s", "the step is at a fold")
     assert not unnamed(out, "7", "0.001 s")
     assert vp.Trajectory.load(path).steps == 7
-
-
-def test_interrupted_run_keeps_its_data(arm, tmp_path, run, monkeypatch):
-    monkeypatch.setattr("varpin.cli.runs.progress_bar", lambda *_, **__: contextlib.nullcontext(interrupt))
-    path = tmp_path / "a.npz"
-    out, err = run("simulate", arm, "--dt", 1e-4, "--steps", 40000, "--save", path, status=130)
-    saved = vp.Trajectory.load(path)
-    assert 0 < saved.steps < 40000
-    (line,) = err.splitlines()
-    assert not unnamed(line, "varpin: interrupted", str(saved.steps))
-    assert not unnamed(out, f"{saved.steps}", "0.0001 s")
-    assert "a.npz" in out
 
 
 def test_long_run_without_a_terminal_says_how_far_it_is(arm, run, monkeypatch):
