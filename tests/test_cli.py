@@ -26,7 +26,6 @@ ROD = '<mass value="1"/><origin xyz="0.5 0 0"/><inertia ixx="0.001" ixy="0" ixz=
 
 @pytest.fixture
 def arm(tmp_path):
-    """A URDF of two rods on joints about y."""
     text = '<link name="base"/>'
     for name, parent, child, x in (("shoulder", "base", "upper", 0), ("elbow", "upper", "lower", 1)):
         text += f'<link name="{child}"><inertial>{ROD}</inertial></link><joint name="{name}" type="continuous">'
@@ -186,7 +185,6 @@ def saved(arm, tmp_path):
 
 
 def drawn(page):
-    """The paths of what a page shows."""
     return [command["path"] for command in commands(page) if command["type"] == "set_object"]
 
 

@@ -49,7 +49,6 @@ def blocks(page, language):
 
 
 def run(*words, cwd):
-    """What Python does with some words."""
     done = subprocess.run([sys.executable, *words], cwd=cwd, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done

@@ -83,7 +83,6 @@ def controls_of(kind):
 @pytest.mark.parametrize("kick", ["left", "split"])
 @pytest.mark.parametrize("kind", ["constant", "feedback", "linear"])
 def test_paths_are_simulations_from_the_children_of_the_generator(kind, kick):
-    """Each from its own start."""
     scene, (q0, v0) = make_scene(), np.random.default_rng(0).normal(size=(2, 40, 2))
     options = {"dt": 0.01, "steps": 50, "controls": controls_of(kind), "integrator": vp.Midpoint(kick=kick)}
     end = run(scene, rng=np.random.default_rng(7) if kind == "linear" else 7, q0=q0, v0=v0, **options)
@@ -255,7 +254,6 @@ def test_an_interrupted_ensemble_carries_warnings(monkeypatch):
 
 
 def test_the_paths_that_stand_out_are_looked_at():
-    """One of 200 starts so fast that its steps are taken in parts."""
     v0 = np.zeros((200, 2))
     v0[137] = 60.0
     scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(1e-3))

@@ -78,7 +78,6 @@ def test_nothing_comes_back_that_was_not_asked_for():
 
 
 def test_meshes_stay_at_home():
-    """A mesh of megabytes that came along in memory."""
     visuals, mesh = pin.GeometryModel(), coal.BVHModelOBBRSS()
     mesh.beginModel(20_000, 60_000)
     mesh.addVertices(np.random.default_rng(0).normal(size=(60_000, 3)))
@@ -149,13 +148,13 @@ def deadly(q, v):
 
 def test_paths_that_were_finished_before_a_worker_was_lost_are_kept():
     scene, q0 = vp.Scene(vp.planar_chain(1), forces=[vp.CustomForce(deadly)]), np.linspace(-1.0, 0.0, 300)[:, None]
-    q0[-1] = 2.1
+    q0[-1], options = 2.1, {"dt": 0.01, "steps": 20, "integrator": vp.ExplicitEuler()}
     with ProcessPoolExecutor(1) as pool, refused(vp.WorkersLost, "lost", ".ensemble") as caught:
-        vp.simulate_ensemble(scene, q0, [0.0], paths=300, rng=0, dt=0.01, steps=4, executor=pool)
+        vp.simulate_ensemble(scene, q0, [0.0], paths=300, rng=0, executor=pool, **options)
     assert isinstance(caught.value.__cause__, BrokenProcessPool)
     kept = caught.value.ensemble
     assert 100 < len(kept.q) < 300
-    motion = vp.simulate(scene, q0[7], [0.0], dt=0.01, steps=4, check=False)
+    motion = vp.simulate(scene, q0[7], [0.0], check=False, **options)
     assert kept.q[7].tobytes() == motion.q.tobytes()
     assert pickle.loads(pickle.dumps(caught.value)).ensemble.q.shape == kept.q.shape
 
@@ -171,7 +170,6 @@ def test_workers_or_executor(spawned):
 
 @pytest.mark.slow
 def test_a_dask_cluster_gives_the_bytes_of_threads():
-    """Two processes of a local cluster, of which one is killed on the way."""
     distributed = pytest.importorskip("distributed")
     plan = plan_of(make_scene())
     with (

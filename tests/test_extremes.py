@@ -27,19 +27,16 @@ assert len(BY_NAME) == len(TRIALS)
 
 
 def made_up(scene, v0, dt=1e-2, steps=100, window=1.0, **options):
-    """A motion of a scene from q = 0."""
     given = {"controls": None, "increments": None, "ahead": 0.0, "window": window} | options
     return Bench("made up", dt, steps, scene, np.zeros(len(v0)), np.array(v0), **given)
 
 
 def falling(dt=1e-2, steps=100, window=0.5, **scene):
-    """Three links that fall, and their motion by the midpoint rule."""
     own = made_up(vp.Scene(rod_chain([1.0] * 3, [1.0] * 3), **scene), [0.0, 1.0, 0.0], dt, steps, window)
     return own, vp.simulate(own.scene, own.q0, own.v0, dt=dt, steps=steps, integrator=vp.Midpoint())
 
 
 def tampered(trajectory, **changes):
-    """The record with other arrays, and nothing said of it."""
     return dataclasses.replace(trajectory, warnings=(), **changes)
 
 
@@ -129,7 +126,6 @@ def test_a_map_that_is_not_symplectic_is_found():
 
 @pytest.mark.parametrize("name", ["spring, h omega = 0.1", *(f"spring and damper, h d / I = {d:g}" for d in (0.1, 1))])
 def test_the_exact_motion_is_exact(name):
-    """A linear oscillator, overdamped and not, in closed form and integrated."""
     own = dataclasses.replace(BY_NAME[name].build(), steps=50)
     integrated = dataclasses.replace(own, closed=None, known={})
     np.testing.assert_allclose(own.exact().q, integrated.exact().q, rtol=0, atol=1e-9)
@@ -206,7 +202,6 @@ def test_errors_without_a_name_are_silent_wrong_and_those_with_one_are_not():
 
 
 def test_motions_that_end_early_are_judged_by_what_there_is(hasty):
-    """One that fails, and one that takes too long."""
     fast = made_up(vp.Scene(rod_chain([1.0] * 2, [1.0] * 2)), [1e3, -500.0], 1e-3, 1000, window=1e-2)
     stopped = run_one(fast, vp.ExplicitEuler())
     long = dataclasses.replace(falling(gravity=False, dt=1e-3, window=0.1)[0], steps=100_000)
@@ -250,7 +245,6 @@ def test_the_command_fails_where_anything_is_silent_wrong(capsys, monkeypatch, f
     honest = robot_checks.attempt
 
     def lying(*given, **options):
-        """The recorded momenta leak."""
         motion, error = honest(*given, **options)
         return tampered(motion, **drifting(motion)), error
 

@@ -23,15 +23,12 @@ def scene():
 
 @pytest.fixture
 def opened():
-    """Views that are closed after the test."""
     with contextlib.ExitStack() as stack:
         yield lambda *given, **options: stack.enter_context(vp.LiveView(*given, open=False, **options))
 
 
 @pytest.fixture
 def seen(opened, browser):
-    """Views that the browser shows."""
-
     def make(*given, **options):
         view = opened(*given, **options)
         browser.get_log("browser")

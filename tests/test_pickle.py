@@ -28,7 +28,6 @@ WAYS = (by_pickle, beside, copy.deepcopy)
 
 
 def arrays_in(x):
-    """The arrays that an object holds, in tuples and mappings too, by where they are."""
     found = {}
     for name, value in getattr(x, "__dict__", {}).items():
         items = value.items() if hasattr(value, "items") else enumerate(value if isinstance(value, tuple) else [value])
@@ -50,7 +49,6 @@ def goes_round(x, use):
 
 
 def moved(scene):
-    """A motion of a scene, by its arrays."""
     n, m = scene.robot.dof, scene.controls
     start = np.linspace(0.1, 0.3, n), np.linspace(-0.5, 0.5, n)
     motion = vp.simulate(scene, *start, dt=1e-3, steps=5, rng=3, controls=np.full(m, 0.1))

@@ -131,7 +131,6 @@ AT, TORQUE = "commanded position [rad]", "control [N m]"
     ],
 )
 def test_controls_have_the_names_of_the_joints_that_they_move(links, options, label, names):
-    """Those of servos and joints moved by hand are positions and velocities."""
     scene = vp.Scene(vp.planar_chain(links), **options)
     motion = vp.simulate(scene, np.full(links, 0.3), np.zeros(links), dt=0.02, steps=3, check=False)
     _, axes = plots.plot_controls(motion, robot=scene.robot)
@@ -246,7 +245,6 @@ def limit_lines(trajectory, robot):
 
 
 def test_plotting_a_motion_imports_no_optimizer():
-    """Only figures of studies have to know studies."""
     found = "any(name.startswith(('varpin.control', 'varpin.study')) for name in sys.modules)"
     program = f"import sys, varpin.show.plots; sys.exit({found})"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

@@ -194,7 +194,6 @@ def test_a_model_without_geometry_gets_a_skeleton(show, browser, caplog):
 
 
 def test_a_missing_mesh_costs_its_link_alone(tmp_path, caplog):
-    """Of a box, an unreadable rod and a ball, the rod alone is drawn as a skeleton."""
     shapes = {
         "box": '<box size="1 1 1"/>',
         "rod": '<mesh filename="no_such_mesh.stl"/>',

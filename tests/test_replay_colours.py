@@ -53,7 +53,6 @@ def visual(shape, material="", where=0):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A cube in three materials, one of which has a texture."""
     squares = np.kron(np.indices((4, 4)).sum(axis=0) % 2, np.ones((4, 4)))[..., None] * np.array([0, 200, 0])
     Image.fromarray(squares.astype(np.uint8)).save(tmp_path / "squares.png")
     (tmp_path / "cube.obj").write_text(CUBE)

@@ -30,13 +30,11 @@ def arm(ur5):
 
 @pytest.fixture(scope="module")
 def sweep():
-    """Configurations of an arm with six joints, 0.05 s apart."""
     t = np.linspace(0.0, 1.0, 21)[:, None]
     return 0.8 * np.sin(np.array([1.0, 2.0, 1.5, 3.0, 2.5, 0.7]) * t + np.arange(6))
 
 
 def places(robot, q, frame):
-    """World positions (N, 3) of a frame, by Pinocchio."""
     return np.array([place.translation for place in placements(robot, np.atleast_2d(q), frame)])
 
 
@@ -232,7 +230,6 @@ GREY, YELLOW, RED = [0.72, 0.76, 0.8], [0.98, 0.75, 0.1], [0.8, 0.05, 0.05]
 
 
 def test_links_take_the_colour_of_their_torque(show, browser):
-    """As a share of its limit; a joint without one is held against its own largest torque."""
     model = vp.planar_chain(2).model
     model.effortLimit = np.array([8.0, np.inf])
     robot = vp.load_robot(model)
@@ -326,7 +323,6 @@ CAPSULES = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05), "joint2": ([0, 0, 0], [1, 0,
 
 @pytest.fixture(scope="module")
 def crank():
-    """A crank whose rod's end slides, and its motion."""
     robot = vp.planar_chain(2, length=0.3, mass=0.5)
     ties = [
         vp.PointOnPoint("tip", (0.0, 0.0, 0.0), axes="z"),
@@ -444,7 +440,6 @@ def test_constraints_can_be_left_out(plan, tmp_path):
 
 
 def test_what_moves_is_drawn_where_it_is(tmp_path):
-    """Obstacles and spheres at the keyframes, from the time that the plan begins at."""
     robot, times = vp.planar_chain(2), np.array([0.5, 0.75, 1.0])
 
     def way(t):

@@ -87,7 +87,6 @@ def test_what_touches_a_finger(change, joints, tmp_path):
 
 
 def test_payload_is_what_pinocchio_makes_of_it(load):
-    """Mass matrix with a payload: that of the robot without, and of the payload's body by its Jacobian."""
     inertia = np.array([[2e-3, 1e-4, 0.0], [1e-4, 3e-3, 2e-4], [0.0, 2e-4, 4e-3]])
     load_ = vp.Payload("tool0", 1.5, center=[0.01, -0.02, 0.1], inertia=inertia)
     bare, loaded = load("ur5"), vp.load_robot("ur5", payload=load_)
@@ -201,7 +200,6 @@ def test_gravity_along_an_axis_touches_no_joint():
 
 
 def test_held_joints_are_those_of_a_robot_that_is_loaded_with_them():
-    """Of the damping of mimic joints and of springs, servos and motors, too."""
     lock = {"panda_joint1": 0.3, "panda_joint5": -0.2}
     whole, robot = vp.load_robot("panda"), vp.load_robot("panda", lock=lock)
     part = vp.Scene(
@@ -266,7 +264,6 @@ def test_locked_joints_are_no_bodies():
 
 
 def two_joint_panda(lock):
-    """panda_joint2 and panda_joint4 with everything they carry, added up link by link."""
     model = vp.load_robot("panda").free_model
     data, q = model.createData(), pin.neutral(model)
     for name, value in (lock | {"panda_finger_joint2": 0.02}).items():

@@ -619,7 +619,6 @@ def test_of_joints_that_cost_nothing_the_ghost_stays_where_they_start(tmp_path):
 
 
 def test_without_an_integrator_a_file_takes_that_of_its_problem(tmp_path):
-    """As in Python: dampers far faster than the step are for an L-stable method."""
     text = '[robot]\nsource = "finger"\n[horizon]\ndt = 1e-2\nsteps = 4\n[[cost]]\ntype = "control"\n'
     for damping, expected in ((0.0, vp.Gauss(3)), (10.0, vp.Radau(4))):
         file = loaded(tmp_path, f"damping = {damping}\n{text}", required_only=False)
@@ -637,7 +636,6 @@ SRDF = """<robot name="made_up">
 
 @pytest.fixture
 def arm(tmp_path):
-    """A URDF file of two joints, and an SRDF file that is not found by its name."""
     (tmp_path / "config").mkdir()
     (tmp_path / "config" / "postures.srdf").write_text(SRDF)
     return write_urdf(tmp_path, link("l1"), link("l2"), joint("j1", "base", "l1"), joint("j2", "l1", "l2"))

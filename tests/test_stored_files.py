@@ -26,7 +26,6 @@ DATA = Path(__file__).parent / "data" / "files"
 
 @functools.cache
 def problem() -> vp.OptimalControlProblem:
-    """Of the stored solution."""
     scene = vp.Scene(vp.planar_chain(2), damping=0.2, noise=vp.AdditiveNoise(0.1))
     cost = vp.TrackingCost([0.8, 0.1], 10.0) + vp.ControlCost(0.1) + vp.ControlRateCost(0.01)
     return vp.OptimalControlProblem(scene, cost, [0.4, -0.3], [0.0, 0.0], dt=0.02, steps=8, integrator=vp.Gauss(4))
@@ -134,7 +133,6 @@ def test_every_entry_is_checked(name, tmp_path):
 
 
 def last(value: float) -> Callable[[np.ndarray], np.ndarray]:
-    """An array with another last number."""
     return lambda array: np.where(np.arange(array.size).reshape(array.shape) == array.size - 1, value, array)
 
 
@@ -178,7 +176,6 @@ def test_pickles_are_not_opened(name, tmp_path):
 
 
 def test_a_wrong_shape_costs_no_memory(tmp_path):
-    """A file of some kilobytes whose q would take 80 MB is refused by its header."""
     path = tmp_path / "a.npz"
     np.savez_compressed(path, **{**members_of("trajectory.npz"), "q": np.zeros((10_000_000, 1, 1))})
     assert path.stat().st_size > 1_000
@@ -345,7 +342,6 @@ def problem_of(
     ],
 )
 def test_a_solution_of_another_problem_is_refused(other, of_file, of_plan, tmp_path):
-    """From a file and to go on from, in both directions."""
     pair = [problem_of(), problem_of(**other)]
     for mine, theirs in (pair, pair[::-1]):
         plan = vp.solve(mine, max_iterations=1, second_order=True, check=False)

@@ -30,7 +30,6 @@ def oscillator():
 
 
 def test_errors_are_those_of_the_closed_form(oscillator):
-    """Of every integrator, at every step: in q and of the energy."""
     members = {str(integrator): integrator for integrator in INTEGRATORS}
     assert len(oscillator.runs) == 4 * len(members)
     for run in oscillator.runs:
@@ -44,6 +43,17 @@ def test_errors_are_those_of_the_closed_form(oscillator):
         assert run.sweeps == run.steps * {"ExplicitEuler": 1, "SemiImplicitEuler": 1}.get(run.integrator, 4) or run.jets
     assert oscillator.samples == 20
     assert oscillator.reference_error < 1e-11
+
+
+def test_rows_of_controls_are_held_over_their_parts():
+    scene, rows = vp.Scene(vp.planar_chain(2), damping=0.5), np.array([[3.0, -1.0], [0.5, 2.0]])
+    start = [0.2, -0.1], [0.5, 0.0]
+    options = {"duration": 0.2, "dts": [0.01], "integrators": [vp.Midpoint()], "repeats": 1}
+    (run,) = vp.work_precision(scene, *start, controls=rows, **options).runs
+    given = {"dt": 0.01, "steps": 20, "controls": np.repeat(rows, 10, axis=0)}
+    motion, exact = (vp.simulate(scene, *start, **given, integrator=own) for own in (vp.Midpoint(), vp.Reference()))
+    assert run.error == pytest.approx(np.abs(motion.q - exact.q).max(), rel=1e-3)
+    assert np.isnan(run.energy_error)
 
 
 def test_pareto_front_is_what_nothing_beats(oscillator):
@@ -92,7 +102,6 @@ class Broken(vp.Midpoint):
 
 
 def test_members_that_fail_do_not_stop_the_others():
-    """Explicit Euler on a stiff spring blows up until it is no longer finite; another member raises."""
     scene = vp.Scene(vp.planar_chain(2), stiffness=1e5)
     options = {"dts": [1e-3], "integrators": [vp.ExplicitEuler(), Broken(), vp.Midpoint()], "repeats": 1}
     record = vp.work_precision(scene, [0.1, 0.0], [0.0, 0.0], duration=0.1, **options)
@@ -181,7 +190,6 @@ def problem():
 
 
 def test_true_costs_of_plans(problem, tmp_path):
-    """Plans of better integrators cost what they promise."""
     members, dts = [vp.ExplicitEuler(), vp.Midpoint()], [0.1, 0.05, 0.025]
     record = vp.optimal_control_tradeoff(problem, members, dts, period=0.1)
     assert [run.hold for run in record.runs] == [1, 2, 4] * 2
@@ -218,7 +226,6 @@ def test_plans_that_fail_do_not_stop_the_others(problem):
     ],
 )
 def test_advice_meets_the_tolerance_and_takes_the_cheapest(robot, seed, rows, tolerance):
-    """The error is that of the motion against the reference's; no choice beside it is cheaper."""
     arm = vp.planar_chain(3) if robot == "chain" else vp.load_robot(robot)
     scene, rng = vp.Scene(arm), np.random.default_rng(seed or 0)
     q0, v0 = np.zeros((2, 3)) if seed is None else rng.uniform([[-1.5], [-1.0]], [[1.5], [1.0]], (2, 6))
