@@ -134,7 +134,7 @@ def table(head, **keys):
     return f"{head}\n" + "".join(f"{key} = {toml(value)}\n" for key, value in keys.items())
 
 
-# Robots, forces and noises by kind and arguments, what else the scenes have, and the table of a file beside them.
+# Of scenes the robot, forces and noises by kind and arguments, what else there is, and the springs.
 WRITTEN = {
     "joints": (
         "ur5",
@@ -149,7 +149,7 @@ WRITTEN = {
             ("state", vp.StateNoise, {"intensity": 0.3, "center": 0.4}),
         ],
         {"damping": {"elbow_joint": 0.1}, "friction": 0.2},
-        "[springs]\nstiffness = 2.0\nrest = { elbow_joint = 0.3 }\n",
+        {"stiffness": 2.0, "rest": {"elbow_joint": 0.3}},
     ),
     "frames": (
         "allegro_right_hand",
@@ -179,7 +179,7 @@ WRITTEN = {
         ],
         [],
         {"gravity": False},
-        "",
+        {},
     ),
 }
 SERVOS = (
@@ -210,11 +210,10 @@ def same_scene(file, **arguments):
 
 @pytest.mark.parametrize("name", WRITTEN)
 def test_a_scene_is_the_one_written_in_python(name, tmp_path):
-    robot, forces, noise, arguments, more = WRITTEN[name]
-    text = table("", **arguments) + table("[robot]", source=robot) + more + HORIZON
+    robot, forces, noise, arguments, springs = WRITTEN[name]
+    text = table("", **arguments) + table("[robot]", source=robot) + table("[springs]", **springs) + HORIZON
     for key, kind, _, given in [("force", *own) for own in forces] + [("noise", *own) for own in noise]:
         text += table(f"[[{key}]]", type=kind, **given)
-    springs = {"stiffness": 2.0, "rest": {"elbow_joint": 0.3}} if more else {}
     made = [[make(**given) for _, make, given in found] for found in (forces, noise)]
     file, reduced = loaded(tmp_path, text, required_only=False), loaded(tmp_path, text)
     scene = same_scene(file, **arguments, **springs, forces=made[0], noise=made[1] or None)
