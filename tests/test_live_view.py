@@ -7,13 +7,11 @@ import time
 
 import numpy as np
 import pytest
-from chromium import names, severe, shapes_stand, wait_until
+from chromium import connect, names, severe, shapes_stand, wait_until
 from refusals import refused
 
 import varpin as vp
 from varpin.show.replay import live, page
-
-ONLINE = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +29,7 @@ def opened():
 def seen(opened, browser):
     def make(*given, **options):
         view = opened(*given, **options)
-        browser.get_log("browser")
-        browser.execute_cdp_cmd("Network.emulateNetworkConditions", ONLINE)
+        connect(browser, online=True)
         browser.get(view.url)
         assert view.wait(60.0)
         return view

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from chromium import animation, commands, picture, seek, severe, shape_poses, shapes_stand, visit, wait_until
+from chromium import animation, commands, connect, picture, seek, severe, shape_poses, shapes_stand, visit, wait_until
 from mechanisms import joint, link, write_urdf
 from refusals import naming, refused
 from selenium.webdriver.common.by import By
@@ -236,8 +236,7 @@ def test_live_window(browser, finger, motion, monkeypatch, capfd):
     try:
         assert opened == [viewer.url()]
         assert capfd.readouterr().out == ""
-        online = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
-        browser.execute_cdp_cmd("Network.emulateNetworkConditions", online)
+        connect(browser, online=True)
         browser.get(viewer.url())
         wait_until(lambda: browser.execute_script("return viewer.animator.duration") == 0.5)
         seek(browser, 0.5)

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pinocchio as pin
 import pytest
-from chromium import animation, commands, names, picture, seek, shape_poses, shapes_stand
+from chromium import animation, commands, names, picture, pose, poses, seek, shape_poses, shapes_stand
 from oracles import placements
 from refusals import refused
 from scipy.spatial.transform import Rotation
@@ -36,19 +36,6 @@ def sweep():
 
 def places(robot, q, frame):
     return np.array([place.translation for place in placements(robot, np.atleast_2d(q), frame)])
-
-
-def pose(browser, path):
-    """A node's transform (4, 4) in the world of meshcat's root."""
-    numbers = browser.execute_script(
-        """
-        const root = viewer.scene_tree.find(["meshcat"]).object;
-        root.updateMatrixWorld(true);
-        const object = viewer.scene_tree.find(["meshcat", ...arguments[0]]).object;
-        return root.matrixWorld.clone().invert().multiply(object.matrixWorld).toArray();""",
-        path,
-    )
-    return np.array(numbers).reshape(4, 4).T
 
 
 def vertices(browser, path):
@@ -160,20 +147,11 @@ def test_a_controllers_run_shows_its_plans(show, browser, run):
 def test_frames_move_with_the_robot(show, browser, arm, sweep):
     show(arm, sweep, dt=0.05, marks=vp.Marks(frames=[TIP, "base_link"]))
     seek(browser, 0.725)
-    paths = browser.execute_script(
-        """
-        const paths = {};
-        viewer.scene_tree.find(["meshcat"]).object.traverse(node => {
-            if (!node.name.includes(" frame ")) return;
-            const path = paths[node.name.split(" ")[2]] = [];
-            for (let at = node; at.name != "meshcat"; at = at.parent) if (at.name) path.unshift(at.name);
-        });
-        return paths;"""
-    )
-    assert sorted(paths) == ["base_link", TIP]
-    for name, path in paths.items():
-        (place,) = placements(arm, 0.5 * (sweep[14:15] + sweep[15:16]), name)
-        np.testing.assert_allclose(pose(browser, path), place.homogeneous, atol=2e-5)
+    found = poses(browser, [], "node.name.includes(' frame ')")
+    assert sorted(name.split()[2] for name in found) == ["base_link", TIP]
+    for name, now in found.items():
+        (place,) = placements(arm, 0.5 * (sweep[14:15] + sweep[15:16]), name.split()[2])
+        np.testing.assert_allclose(now, place.homogeneous, atol=2e-5)
 
 
 def test_targets_stand_or_move(show, browser, arm, sweep):
