@@ -1,7 +1,5 @@
 """Joint values by name, holding torques and gravity: what a scene and those who take a state accept."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -15,9 +15,9 @@ ARRAYS = ("q", "v", "p", "u", "energy")
 START = {"q0": [0.3, -0.2], "v0": [0.0, 1.0]}
 
 
-def make_scene(strength=0.3, **options):
-    noise = vp.AdditiveNoise(strength) + vp.ControlNoise(0.2) + vp.StateNoise(0.1)
-    return vp.Scene(vp.planar_chain(2), damping=0.2, stiffness=3.0, noise=noise, **options)
+def make_scene():
+    noise = vp.AdditiveNoise(0.3) + vp.ControlNoise(0.2) + vp.StateNoise(0.1)
+    return vp.Scene(vp.planar_chain(2), damping=0.2, stiffness=3.0, noise=noise)
 
 
 def run(scene=None, **options):

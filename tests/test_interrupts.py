@@ -1,7 +1,5 @@
 """Ctrl-C in a process of its own: answered at once, and what is being written is written."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """What a replay's shapes look like: colours of mesh files, textures, and a node of its own for each."""
 
-from __future__ import annotations
-
 import logging
 
 import numpy as np

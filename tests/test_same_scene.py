@@ -1,7 +1,5 @@
 """A motion is linearized in the scene that made it: any other is told from it, by name."""
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import replace
 
