@@ -25,11 +25,11 @@ import numpy as np
 import varpin as vp
 from varpin.model import bundled_robots
 from varpin.model.example_robot_data import installed
+from varpin.study.extremes import Kind, Record
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 import battery  # noqa: E402
-from battery import Kind, Record  # noqa: E402
 from mechanisms import random_tree  # noqa: E402
 
 TREES = 200
@@ -83,7 +83,7 @@ def judged(chosen: Sequence[str], folder: Path, turns: int) -> Iterator[tuple[st
 
         path = folder / f"{name}.pickle"
         if not path.exists():
-            record = battery.run(robot, trials=trials_of(name, robot, turns), patience=PATIENCE, progress=tell)
+            record = battery.run(trials_of(name, robot, turns), name=robot.name, patience=PATIENCE, progress=tell)
             path.write_bytes(pickle.dumps(record))
             sys.stderr.write("\r" + " " * 118 + "\r")
         yield name, robot, pickle.loads(path.read_bytes())
@@ -119,7 +119,7 @@ def _row(name: str, joints: int | str, records: Sequence[Record]) -> str:
 def scenes(path: Path, *, deep: bool) -> int:
     """The record of the scenes, in a file; returns the exit status."""
 
-    record = battery.run(deep=deep, progress=lambda done, cells: sys.stderr.write(f"\r{done}/{cells}"))
+    record = battery.run(battery.TRIALS, deep=deep, progress=lambda done, cells: sys.stderr.write(f"\r{done}/{cells}"))
     path.write_bytes(pickle.dumps(record))
     needless = sum(cell.kind is Kind.DEGRADED and not cell.found for cell in record.runs)
     print(f"\n{record}, {needless} warnings without need")

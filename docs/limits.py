@@ -11,20 +11,19 @@ from __future__ import annotations
 import pickle
 import sys
 from collections.abc import Callable, Iterator
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.study.checks import LEVELS
-from varpin.study.exact import Exact
+from varpin.study.extremes import Cell, Kind, Record
 
 DOCUMENT = Path(__file__).resolve().parent / "limits.md"
 sys.path[:0] = [str(DOCUMENT.parents[1] / name) for name in ("benchmarks", "tests")]
 import peers  # noqa: E402
-from battery import TRIALS, Cell, Kind, Record, Trial  # noqa: E402
-from battery.exact import exact_motion  # noqa: E402
+from battery import TRIALS, Bench  # noqa: E402
 from pages import fill  # noqa: E402
 
 OWN = {"Midpoint": "Midpoint(alpha=0.5)", "Gauss(4)": "Gauss(stages=4)", "RungeKutta4": "RungeKutta4"}
@@ -64,8 +63,9 @@ def peers_table(record: Record) -> Iterator[str]:
     for trial in TRIALS:
         if trial.name in SHARED:
             sys.stderr.write(f"{trial.name}\n")
-            own = {name: in_varpin(cells[trial.name, text], trial) for name, text in OWN.items()}
-            rows[trial.name] = own | {name: in_words(trial, motion) for name, motion in MOTIONS.items()}
+            bench = trial.build()
+            own = {name: in_varpin(cells[trial.name, text], bench) for name, text in OWN.items()}
+            rows[trial.name] = own | {name: in_words(bench, motion) for name, motion in MOTIONS.items()}
     names = [name for name in next(iter(rows.values())) if any(row[name] for row in rows.values())]
     yield f"| scene | {' | '.join(names)} |"
     yield "|---" * (1 + len(names)) + "|"
@@ -73,12 +73,12 @@ def peers_table(record: Record) -> Iterator[str]:
         yield f"| {scene} | {' | '.join(row[name] for name in names)} |"
 
 
-def in_varpin(cell: Cell, trial: Trial) -> str:
+def in_varpin(cell: Cell, bench: Bench) -> str:
     """A cell in words."""
     if cell.kind is Kind.REFUSED:
         return "refused"
     if cell.kind is Kind.STOPPED:
-        return f"stops at {cell.done * trial.dt:.2g} s"
+        return f"stops at {cell.done * bench.dt:.2g} s"
     return outcome(cell.error, cell.energy, "told" if cell.kind is Kind.DEGRADED else "")
 
 
@@ -89,14 +89,12 @@ def outcome(error: float, energy: float, said: str) -> str:
     return f"{text}, {said}" if said else f"**{text}**" if wrong else text
 
 
-def in_words(trial: Trial, motion: Callable[[peers.Case, float], peers.Motion | None]) -> str:
+def in_words(bench: Bench, motion: Callable[[peers.Case, float], peers.Motion | None]) -> str:
     """Error of another simulator's motion from the exact one, its energy error, and what it says."""
-    setup = trial.build()
-    case = peers.Case(
-        trial.name, setup.scene, setup.q0, setup.v0, np.zeros(setup.scene.controls), trial.dt * trial.steps
-    )
+    scene = bench.scene
+    case = peers.Case(bench.name, scene, bench.q0, bench.v0, np.zeros(scene.controls), bench.dt * bench.steps)
     try:
-        found = motion(case, trial.dt)
+        found = motion(case, bench.dt)
     except (ValueError, RuntimeError) as error:
         # The mechanism itself is refused, each library in its own words.
         sys.stderr.write(f"  refused: {str(error).splitlines()[0]}\n")
@@ -108,23 +106,17 @@ def in_words(trial: Trial, motion: Callable[[peers.Case, float], peers.Motion | 
     q, v = found.q, found.v
     if not (np.isfinite(q).all() and np.isfinite(v).all()):
         first = int(np.argmin(np.isfinite(q).all(axis=1) & np.isfinite(v).all(axis=1)))
-        return f"**not finite from {first * trial.dt:.2g} s**"
-    exact = truth(trial)
+        return f"**not finite from {first * bench.dt:.2g} s**"
+    exact = bench.exact()
     known = exact.nodes < len(q)
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.abs(q[exact.nodes[known]] - exact.q[known]).max(initial=0.0) / exact.travel
         at = np.unique(np.linspace(0, len(q) - 1, 200).astype(int))
-        jets = [lagrangian_jet(setup.scene, q[k], v[k]) for k in at]
+        jets = [lagrangian_jet(scene, q[k], v[k]) for k in at]
         kinetic = np.array([0.5 * v[k] @ jet.Lv for k, jet in zip(at, jets, strict=True)])
         total = 2.0 * kinetic - np.array([jet.L for jet in jets])
         energy = np.nan_to_num(np.abs(total - total[0]).max() / max(kinetic.max(), np.finfo(float).tiny), nan=np.inf)
     return outcome(float(error), float(energy), found.said)
-
-
-@cache
-def truth(trial: Trial) -> Exact:
-    """The exact motion of a trial, computed once."""
-    return exact_motion(trial.build(), trial.dt, trial.steps, trial.window)
 
 
 if __name__ == "__main__":

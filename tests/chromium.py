@@ -23,11 +23,7 @@ FLAGS = [
     "--use-gl=angle",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
     "--disable-component-update",
-    "--disable-sync",
     "--disable-dev-shm-usage",
     "--window-size=800,600",
 ]
@@ -64,15 +60,19 @@ def wait_until(condition, seconds=60.0):
         time.sleep(0.05)
 
 
+def connect(browser, online):
+    browser.get_log("browser")
+    browser.execute_cdp_cmd("Network.enable", {})
+    speeds = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+    browser.execute_cdp_cmd("Network.emulateNetworkConditions", {"offline": not online, **speeds})
+
+
 def visit(browser, path):
     """Load a page offline; returns once every command has reached the viewer.
 
     It moves, but is not drawn until there is a picture of it.
     """
-    browser.get_log("browser")
-    browser.execute_cdp_cmd("Network.enable", {})
-    offline = {"offline": True, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
-    browser.execute_cdp_cmd("Network.emulateNetworkConditions", offline)
+    connect(browser, online=False)
     browser.get(path.as_uri())
     wait_until(lambda: browser.execute_script("return document.documentElement.dataset.loaded"))
 
@@ -100,21 +100,36 @@ def picture(browser):
     return np.asarray(image, dtype=float)[40 : image.height - bar]
 
 
+# In scripts: the transform of a node in the world of meshcat's root.
+PLACE = """
+    const root = viewer.scene_tree.find(["meshcat"]).object;
+    root.updateMatrixWorld(true);
+    const place = node => root.matrixWorld.clone().invert().multiply(node.matrixWorld).toArray();
+"""
+
+
+def pose(browser, path):
+    """The transform (4, 4) of a node."""
+    script = PLACE + "return place(viewer.scene_tree.find(['meshcat', ...arguments[0]]).object);"
+    return np.reshape(browser.execute_script(script, path), (4, 4)).T
+
+
+def poses(browser, figure, which):
+    """The transforms (4, 4) of the nodes of a figure for which a condition on ``node`` holds, by their names."""
+    script = f"""
+        const poses = {{}};
+        viewer.scene_tree.find(["meshcat", ...arguments[0]]).object.traverse(node => {{
+            if ({which}) poses[node.name] = place(node);
+        }});
+        return poses;"""
+    found = browser.execute_script(PLACE + script, figure)
+    return {name: np.reshape(numbers, (4, 4)).T for name, numbers in found.items()}
+
+
 def shape_poses(browser, figure="robot"):
-    """World transforms (4, 4) of the robot's or its ghost's shapes on the page, in their own world, by index."""
-    poses = browser.execute_script(
-        """
-        const root = viewer.scene_tree.find(["meshcat"]).object, poses = {};
-        root.updateMatrixWorld(true);
-        const inverse = root.matrixWorld.clone().invert();
-        viewer.scene_tree.find(["meshcat", arguments[0]]).object.traverse(node => {
-            if (node.parent && node.parent.name == "shapes")
-                poses[node.name.split(" ")[0]] = inverse.clone().multiply(node.matrixWorld).toArray();
-        });
-        return poses;""",
-        figure,
-    )
-    return {int(k): np.array(pose).reshape(4, 4).T for k, pose in poses.items()}
+    """Those of the robot's or its ghost's shapes, by index."""
+    found = poses(browser, [figure], "node.parent && node.parent.name == 'shapes'")
+    return {int(name.split(" ")[0]): place for name, place in found.items()}
 
 
 def shapes_stand(browser, robot, q, figure="robot", shift=0.0):
@@ -122,10 +137,10 @@ def shapes_stand(browser, robot, q, figure="robot", shift=0.0):
     model, shapes = robot.model, geometry(robot)
     data, placements = model.createData(), shapes.createData()
     pin.updateGeometryPlacements(model, data, shapes, placements, robot.configuration(np.asarray(q)))
-    poses = shape_poses(browser, figure)
+    found = shape_poses(browser, figure)
     moving = [k for k, shape in enumerate(shapes.geometryObjects) if shape.parentJoint > 0]
-    assert sorted(poses) == (moving if figure.startswith("ghost") else list(range(shapes.ngeoms)))
-    off = [poses[k] - placements.oMg[k].homogeneous for k in poses]
+    assert sorted(found) == (moving if figure.startswith("ghost") else list(range(shapes.ngeoms)))
+    off = [found[k] - placements.oMg[k].homogeneous for k in found]
     return np.abs(off - np.pad(np.reshape(shift, (-1, 1)) * np.ones((3, 1)), ((0, 1), (3, 0)))).max() < 2e-5
 
 

@@ -75,3 +75,17 @@ def browser(chromium_session):
     """The session's browser. A page left open would go on drawing, at the cost of the tests after it."""
     yield chromium_session
     chromium_session.get("about:blank")
+
+
+@pytest.fixture
+def show(browser, tmp_path):
+    """A function that replays on a page, opens that and returns its path; to the end the page has no errors."""
+    from chromium import severe, visit  # noqa: PLC0415 - as above
+
+    def make(*given, **options):
+        path = vp.replay(*given, html=tmp_path / "page.html", **options)
+        visit(browser, path)
+        return path
+
+    yield make
+    assert severe(browser) == []

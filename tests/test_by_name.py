@@ -1,7 +1,5 @@
 """Joint values by name, holding torques and gravity: what a scene and those who take a state accept."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -67,20 +65,19 @@ def test_values_by_name_are_those_of_a_row(use):
         lambda value: vp.Scene(UR5, damping=value),
         lambda value: vp.Scene(UR5, noise=vp.AdditiveNoise(value)),
         lambda value: vp.JointLimitBarrier(UR5, value),
-        lambda value: vp.simulate(vp.Scene(UR5), value, np.zeros(6), dt=1e-3, steps=1),
-        lambda value: vp.simulate_ensemble(vp.Scene(UR5), np.zeros(6), value, dt=1e-3, steps=1, paths=1, rng=0),
-        lambda value: vp.OptimalControlProblem(vp.Scene(UR5), vp.ControlCost(), value, ROW, dt=1e-3, steps=1),
-        lambda value: vp.lagrangian_jet(vp.Scene(UR5), value, np.zeros(6)),
-        lambda value: vp.Scene(UR5).holding_torque(value),
+        motion,
+        lambda value: vp.simulate_ensemble(SCENE, ROW, value, paths=1, rng=0, **STEPS),
+        problem,
+        lambda value: vp.lagrangian_jet(SCENE, value, ROW),
+        SCENE.holding_torque,
         lambda value: vp.inspect_robot(UR5, q=value),
-        lambda value: vp.advise(vp.Scene(UR5), value, np.zeros(6), duration=1.0, tolerance=1e-3),
+        lambda value: vp.advise(SCENE, value, ROW, duration=1.0, tolerance=1e-3),
     ],
 )
 def test_names_and_numbers_that_are_none_are_named(call):
     with refused(vp.UnknownJoint, "'elbow'", "'elbow_joint'") as caught:
         call({"elbow": 1.0})
-    assert caught.value.matches[0] == "elbow_joint"
-    assert caught.value.known == NAMES
+    assert (caught.value.matches[0], caught.value.known) == ("elbow_joint", NAMES)
     for value, facts in ((np.nan, ("'elbow_joint'", "nan")), ("a", "'a'")):
         with refused(vp.InputError, facts):
             call({"elbow_joint": value})
@@ -136,14 +133,10 @@ def test_torques_of_some_joints_in_another_order_take_names():
 
 
 USES = [
-    lambda scene, value: vp.simulate(scene, ROW, ROW, controls=value, dt=1e-3, steps=1),
-    lambda scene, value: vp.OptimalControlProblem(scene, vp.ControlCost(value), ROW, ROW, dt=1e-3, steps=1),
-    lambda scene, value: vp.OptimalControlProblem(
-        scene, vp.ControlCost() + vp.ControlRateCost(value), ROW, ROW, dt=1e-3, steps=1
-    ),
-    lambda scene, value: vp.OptimalControlProblem(
-        scene, vp.ControlCost(), ROW, ROW, control_limits=(-np.inf, value), dt=1e-3, steps=1
-    ),
+    lambda scene, value: motion(scene=scene, controls=value),
+    lambda scene, value: problem(cost=vp.ControlCost(value), scene=scene),
+    lambda scene, value: problem(cost=vp.ControlRateCost(value), scene=scene),
+    lambda scene, value: problem(scene=scene, control_limits=(-np.inf, value)),
 ]
 
 

@@ -1,6 +1,5 @@
 """The ``varpin`` command: what it prints, writes and returns."""
 
-import contextlib
 import io
 import logging
 import re
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 from chromium import commands
 from findings import about
+from mechanisms import joint, write_urdf
 from refusals import naming, unnamed
 from rich.console import Console
 
@@ -26,7 +26,6 @@ ROD = '<mass value="1"/><origin xyz="0.5 0 0"/><inertia ixx="0.001" ixy="0" ixz=
 
 @pytest.fixture
 def arm(tmp_path):
-    """A URDF of two rods on joints about y."""
     text = '<link name="base"/>'
     for name, parent, child, x in (("shoulder", "base", "upper", 0), ("elbow", "upper", "lower", 1)):
         text += f'<link name="{child}"><inertial>{ROD}</inertial></link><joint name="{name}" type="continuous">'
@@ -36,19 +35,31 @@ def arm(tmp_path):
     return str(path)
 
 
-def error_of(capsys):
-    """The one line on stderr, and nothing on stdout."""
-    out, err = capsys.readouterr()
-    assert out == ""
-    (line,) = err.splitlines()
-    return line
+@pytest.fixture
+def run(capsys):
+    """A function that runs a command and returns what it prints on stdout and stderr; its status is as expected."""
+
+    def command(*words, status=0):
+        capsys.readouterr()
+        assert main([*map(str, words)]) == status
+        return capsys.readouterr()
+
+    return command
 
 
-def test_trajectory_is_what_the_options_say(arm, tmp_path):
+def full(self, path):
+    raise OSError(28, "No space left on device")
+
+
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
+def test_trajectory_is_what_the_options_say(arm, tmp_path, run):
     path = tmp_path / "motion.npz"
     options = "--q0 -0.5 2e-1 --v0 1 --gravity 0 -1e-1 -5 --damping elbow=0.2 --stiffness 3 --torque -1e-2 0.5"
     options += f" --integrator Midpoint(0.25) --dt 5e-3 --duration 0.5 --quiet --save {path}"
-    assert main(["simulate", arm, *options.split()]) == 0
+    run("simulate", arm, *options.split())
     saved = vp.Trajectory.load(path)
     scene = vp.Scene(load_robot(arm), gravity=[0.0, -0.1, -5.0], damping=[0.0, 0.2], stiffness=3.0)
     again = vp.simulate(
@@ -58,9 +69,9 @@ def test_trajectory_is_what_the_options_say(arm, tmp_path):
         np.testing.assert_array_equal(getattr(saved, name), getattr(again, name))
 
 
-def test_start_is_at_rest_at_zero_under_earths_gravity_for_two_seconds(arm, tmp_path):
+def test_start_is_at_rest_at_zero_under_earths_gravity_for_two_seconds(arm, tmp_path, run):
     path = tmp_path / "motion.npz"
-    assert main(["simulate", arm, "--quiet", "--save", str(path)]) == 0
+    run("simulate", arm, "--quiet", "--save", path)
     saved = vp.Trajectory.load(path)
     assert (saved.steps, saved.dt) == (2000, 1e-3)
     assert not saved.q[0].any()
@@ -69,11 +80,9 @@ def test_start_is_at_rest_at_zero_under_earths_gravity_for_two_seconds(arm, tmp_
     np.testing.assert_array_equal(saved.q, again.q)
 
 
-def test_outputs_are_written_and_listed(arm, tmp_path, capsys):
+def test_outputs_are_written_and_listed(arm, tmp_path, run):
     npz, png, html = (tmp_path / name for name in ("a.npz", "a.png", "a.html"))
-    options = ["--steps", "30", "--dt", "0.01", "--save", str(npz), "--plot", str(png), "--html", str(html)]
-    assert main(["simulate", arm, *options]) == 0
-    out = capsys.readouterr().out
+    out, _ = run("simulate", arm, "--steps", 30, "--dt", 0.01, "--save", npz, "--plot", png, "--html", html)
     assert vp.Trajectory.load(npz).steps == 30
     assert png.read_bytes().startswith(b"\x89PNG")
     assert b"<html" in html.read_bytes()[:500].lower()
@@ -82,11 +91,11 @@ def test_outputs_are_written_and_listed(arm, tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.html", "a.npz", "a.png", "arm.urdf"]
 
 
-def test_all_warnings_are_printed(tmp_path, capsys):
-    start = ["--dt", "0.05", "--steps", "20", "--v0", "8", "0", "0", "0", "0", "0", "--save", str(tmp_path / "a.npz")]
-    assert main(["simulate", "ur5", "--integrator", "midpoint", *start]) == 0
-    said = " ".join(re.sub(r"\s+", " ", "".join(capsys.readouterr())).replace("warning ", "").split())
-    told = vp.Trajectory.load(tmp_path / "a.npz").warnings
+def test_all_warnings_are_printed(tmp_path, run):
+    path = tmp_path / "a.npz"
+    start = ["--dt", 0.05, "--steps", 20, "--v0", 8, *[0] * 5, "--save", path, "--integrator", "midpoint"]
+    said = " ".join("".join(run("simulate", "ur5", *start)).replace("warning ", "").split())
+    told = vp.Trajectory.load(path).warnings
     assert len(told) > 1
     assert not unnamed(said, *(str(finding.joint) for finding in told), *(finding.kind[:-1] for finding in told[1:]))
 
@@ -95,21 +104,16 @@ MISTAKES = [
     ("simulate ARM --damping 1 2 3", ("--damping", "2", "3")),
     # What simulate refuses is refused in its words.
     ("simulate ARM --damping -1", ("damping[0]", "-1.0")),
-    ("simulate ARM --dt 0", ("--dt", "0.0")),
     ("simulate ARM --duration 1 --dt 0.003", ("duration = 1 s", "dt = 0.003 s", f"dt = {1 / 333!r} s")),
-    ("simulate ARM --steps -3", ("steps", "-3")),
     ("simulate ARM --tolerance 1e-6 --dt 0.1", ("dt", "tolerance")),
     ("simulate ARM --integrator gaus", ("'gaus'", "Gauss", "Midpoint")),
     ("simulate ARM --integrator RungeKutta4(stages=2)", ("'stages'", "RungeKutta4")),
     ("simulate ARM --q0 elbow=1 2", ("--q0", "JOINT=VALUE")),
     ("simulate ARM --v0 elbow=1 elbow=2", ("--v0", "once", "elbow=2")),
-    ("simulate ARM --v0 elbow=a", ("--v0", "elbow=a", "JOINT=VALUE")),
-    ("simulate ARM --q0 =1", ("--q0", "=1", "JOINT=VALUE")),
     ("simulate ARM --lock elbow", ("--lock", "elbow", "JOINT=VALUE")),
     ("simulate ARM --save a.txt", ("--save", ".npz", "'a.txt'")),
     ("simulate nobody.urdf", "'nobody.urdf'"),
     ("advise ARM --tolerance 0", "tolerance"),
-    ("replay none.npz", "none.npz"),
     ("replay SAVED", ("'arm'", "URDF")),
     ("replay SAVED --robot ur5", ("shoulder, elbow", "'ur5'", "shoulder_pan_joint")),
     ("replay SAVED --robot ARM --trace nose", ("--trace", "'arm'", "'nose'")),
@@ -127,11 +131,10 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize(("words", "facts"), MISTAKES)
-def test_mistakes_are_one_line_and_status_2(words, facts, arm, saved, scene, tmp_path, capsys):
+def test_mistakes_are_one_line_and_status_2(words, facts, arm, saved, scene, tmp_path, run):
     (tmp_path / "broken.toml").write_text("[robot]\n[horizon]\ndt = 1\nsteps = 1\n")
     names = {"ARM": arm, "SAVED": saved}
-    assert main([names.get(word, word) for word in words.split()]) == 2
-    *_, line = capsys.readouterr().err.splitlines()
+    *_, line = run(*(names.get(word, word) for word in words.split()), status=2).err.splitlines()
     assert line.startswith("varpin: error: ")
     assert not unnamed(line, facts)
 
@@ -152,19 +155,21 @@ def test_usage_errors_are_one_line_and_status_2(capsys, words, facts):
     with pytest.raises(SystemExit) as stop:
         main(words.split())
     assert stop.value.code == 2
-    line = error_of(capsys)
+    out, err = capsys.readouterr()
+    (line,) = err.splitlines()
+    assert out == ""
     assert not unnamed(line, facts)
     assert re.search(r" \(see varpin( \w+)? --help\)$", line)
 
 
-def test_what_advise_answers_is_a_motion_within_the_tolerance(arm, tmp_path, capsys):
-    options = ["--duration", "0.3", "--q0", "shoulder=0.3", "--v0", "-1e-1", "0", "--damping", "0.1"]
-    options += ["--torque", "elbow=-2.5", "--gravity", "1", "0", "-9", "--package-dir", str(tmp_path)]
-    assert main(["advise", arm, "--tolerance", "1e-6", *options]) == 0
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("run it: varpin ")]
+def test_what_advise_answers_is_a_motion_within_the_tolerance(arm, tmp_path, run):
+    options = ["--duration", 0.3, "--q0", "shoulder=0.3", "--v0", "-1e-1", 0, "--damping", 0.1]
+    options += ["--torque", "elbow=-2.5", "--gravity", 1, 0, -9, "--package-dir", tmp_path]
+    out = run("advise", arm, "--tolerance", 1e-6, *options).out
+    (line,) = [line for line in out.splitlines() if line.startswith("run it: varpin ")]
     words = shlex.split(line.removeprefix("run it: varpin ").partition(", and")[0])
     path = tmp_path / "a.npz"
-    assert main([*words, *options[2:], "--save", str(path), "--quiet"]) == 0
+    run(*words, *options[2:], "--save", path, "--quiet")
     motion = vp.Trajectory.load(path)
     assert motion.duration == pytest.approx(0.3, rel=1e-12)
     scene = vp.Scene(load_robot(arm), gravity=[1, 0, -9], damping=0.1)
@@ -179,63 +184,57 @@ def saved(arm, tmp_path):
     return str(motion.save(tmp_path / "motion.npz"))
 
 
-def test_a_saved_motion_is_replayed(arm, saved, tmp_path, capsys):
+def drawn(page):
+    return [command["path"] for command in commands(page) if command["type"] == "set_object"]
+
+
+def test_a_saved_motion_is_replayed(arm, saved, tmp_path, run):
     page = tmp_path / "page.html"
-    words = ["--trace", "lower", "--ghost", saved, "--speed", "0.5", "--frames", "upper"]
-    assert main(["replay", saved, "--robot", arm, "--html", str(page), *words]) == 0
-    assert capsys.readouterr().out == f"written: {page}\n"
-    paths = [command["path"] for command in commands(page) if command["type"] == "set_object"]
-    assert any(path.endswith("motion lower") for path in paths)
-    assert any(path.endswith("frame upper") for path in paths), paths
+    words = ["--trace", "lower", "--ghost", saved, "--speed", 0.5, "--frames", "upper"]
+    assert run("replay", saved, "--robot", arm, "--html", page, *words).out == f"written: {page}\n"
+    assert any(path.endswith("motion lower") for path in drawn(page))
+    assert any(path.endswith("frame upper") for path in drawn(page))
 
 
-def test_a_saved_plan_is_replayed_with_its_task(scene, tmp_path):
-    assert main(["solve", scene, "--max-iterations", "1", "--save", "plan.npz", "--quiet"]) == console.STEP_FAILED
-    assert main(["replay", "plan.npz", "--robot", scene, "--html", "plan.html"]) == 0
-    paths = [command["path"] for command in commands(tmp_path / "plan.html") if command["type"] == "set_object"]
-    assert any(path.startswith("/meshcat/ghost/") for path in paths)
-    assert main(["replay", "plan.npz", "--html", "bare.html"]) == 0
+def test_plans_are_replayed_with_their_task(scene, tmp_path, run):
+    run("solve", scene, "--max-iterations", 1, "--save", "plan.npz", "--quiet", status=console.STEP_FAILED)
+    run("replay", "plan.npz", "--robot", scene, "--html", "plan.html")
+    run("replay", "plan.npz", "--html", "bare.html")
+    run("solve", scene, "--html", "motion.html", "--trace", "pip", "--quiet")
+    for page in ("plan.html", "motion.html"):
+        assert any(path.startswith("/meshcat/ghost/") for path in drawn(tmp_path / page))
+    traces = {path.split("/")[3] for path in drawn(tmp_path / page) if " motion " in path or " ghost " in path}
+    assert traces == {"0 motion pip"}  # and the ghost's joints stay
 
 
-def test_replay_opens_a_window_until_ctrl_c(saved, arm, monkeypatch, capsys):
-    class Viewer:
-        def url(self):
-            return "http://here"
-
-    def interrupt(_seconds):
-        raise KeyboardInterrupt
-
-    shown = []
-    monkeypatch.setattr("varpin.show.replay.motion.replay", lambda *words, **options: shown.append(options) or Viewer())
+def test_replay_opens_a_window_until_ctrl_c(saved, arm, monkeypatch, run):
+    shown, viewer = [], type("Viewer", (), {"url": lambda self: "http://here"})
+    monkeypatch.setattr("varpin.show.replay.motion.replay", lambda *words, **options: shown.append(options) or viewer())
     monkeypatch.setattr("varpin.cli.views.time.sleep", interrupt)
-    assert main(["replay", saved, "--robot", arm]) == 0
-    assert not unnamed(capsys.readouterr().err, "http://here", "Ctrl-C")
+    assert not unnamed(run("replay", saved, "--robot", arm).err, "http://here", "Ctrl-C")
     assert shown[0]["open"]
 
 
-def test_outputs_are_checked_before_the_run(arm, tmp_path, capsys, monkeypatch):
+def test_outputs_are_checked_before_the_run(arm, tmp_path, run, monkeypatch):
     monkeypatch.setattr("varpin.cli.runs.simulate", lambda *_, **__: pytest.fail("the run must not start"))
-    kept = str(tmp_path / "kept.npz")
-    for option, path in (("--html", "/nowhere/a.html"), ("--plot", "/nowhere/a.png"), ("--save", str(tmp_path))):
-        assert main(["simulate", arm, "--save", kept, option, path]) == 2
-        assert not unnamed(error_of(capsys), path)
-    film = str(tmp_path / "kept.gif")
-    assert main(["simulate", arm, "--video", film, "--save", film]) == 2
-    assert not unnamed(error_of(capsys), "--save", ".npz")
-    (tmp_path / "same.html").symlink_to(tmp_path / "same.png")
-    words = ["--plot", str(tmp_path / "same.png"), "--html", str(tmp_path / "same.html")]
-    assert main(["simulate", arm, *words]) == 2
-    assert not unnamed(error_of(capsys), "one file")
+    kept, film, png, html = (tmp_path / name for name in ("kept.npz", "kept.gif", "same.png", "same.html"))
+    html.symlink_to(png)
+    for words, facts in (
+        (["--save", kept, "--html", "/nowhere/a.html"], "/nowhere/a.html"),
+        (["--save", kept, "--plot", "/nowhere/a.png"], "/nowhere/a.png"),
+        (["--save", tmp_path], str(tmp_path)),
+        (["--video", film, "--save", film], ("--save", ".npz")),
+        (["--plot", png, "--html", html], "one file"),
+    ):
+        out, err = run("simulate", arm, *words, status=2)
+        assert (out, len(err.splitlines())) == ("", 1)
+        assert not unnamed(err, facts)
 
 
-def test_output_that_fails_after_the_run_leaves_the_others(arm, tmp_path, capsys, monkeypatch):
-    def full(self, path):
-        raise OSError(28, "No space left on device")
-
+def test_output_that_fails_after_the_run_leaves_the_others(arm, tmp_path, run, monkeypatch):
     monkeypatch.setattr(vp.Trajectory, "save", full)
     npz, png = tmp_path / "a.npz", tmp_path / "a.png"
-    assert main(["simulate", arm, "--steps", "5", "--save", str(npz), "--plot", str(png)]) == 2
-    out, err = capsys.readouterr()
+    out, err = run("simulate", arm, "--steps", 5, "--save", npz, "--plot", png, status=2)
     assert err.startswith(f"varpin: error: {npz} was not written: ")
     assert "No space left on device" in err
     assert png.exists()
@@ -243,56 +242,33 @@ def test_output_that_fails_after_the_run_leaves_the_others(arm, tmp_path, capsys
     assert "a.npz" not in out
 
 
-def test_a_solution_that_was_not_saved_is_not_continued_from(scene, capsys, monkeypatch):
-    def full(self, path):
-        raise OSError(28, "No space left on device")
-
+def test_a_solution_that_was_not_saved_is_not_continued_from(scene, run, monkeypatch):
     monkeypatch.setattr(vp.Solution, "save", full)
-    assert main(["solve", scene, "--max-iterations", "1", "--save", "part.npz"]) == console.STEP_FAILED
-    err = capsys.readouterr().err
+    words = "solve", scene, "--max-iterations", 1, "--save", "part.npz"
+    err = run(*words, status=console.STEP_FAILED).err
     assert not unnamed(err, "No space left on device", "not converged", "--save NPZ")
     assert "--resume" not in err
 
 
-def test_failed_step_keeps_what_was_before_it(arm, tmp_path, capsys, monkeypatch):
-    whole = vp.simulate
-
+def test_failed_step_keeps_what_was_before_it(arm, tmp_path, run, monkeypatch):
     def failing(*arguments, **options):
-        part = whole(*arguments, **{**options, "steps": 7})
+        part = vp.simulate(*arguments, **{**options, "steps": 7})
         failure = type("Failure", (), {"reason": "the step is at a fold", "residual": 3.5})
         raise vp.StepFailure(part.steps, part.t[-1], failure, part)
 
     monkeypatch.setattr("varpin.cli.runs.simulate", failing)
     path = tmp_path / "a.npz"
-    assert main(["simulate", arm, "--steps", "20", "--save", str(path)]) == 3
-    out, err = capsys.readouterr()
+    out, err = run("simulate", arm, "--steps", 20, "--save", path, status=3)
     (line,) = err.splitlines()
     assert not unnamed(line, "varpin: error", "step 7", "t = 0.007 s", "the step is at a fold")
     assert not unnamed(out, "7", "0.001 s")
     assert vp.Trajectory.load(path).steps == 7
 
 
-def test_interrupted_run_keeps_its_data(arm, tmp_path, capsys, monkeypatch):
-    def interrupt(done, steps):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("varpin.cli.runs.progress_bar", lambda *_, **__: contextlib.nullcontext(interrupt))
-    path = tmp_path / "a.npz"
-    assert main(["simulate", arm, "--dt", "1e-4", "--steps", "40000", "--save", str(path)]) == 130
-    out, err = capsys.readouterr()
-    saved = vp.Trajectory.load(path)
-    assert 0 < saved.steps < 40000
-    (line,) = err.splitlines()
-    assert not unnamed(line, "varpin: interrupted", str(saved.steps))
-    assert not unnamed(out, f"{saved.steps}", "0.0001 s")
-    assert "a.npz" in out
-
-
-def test_long_run_without_a_terminal_says_how_far_it_is(arm, capsys, monkeypatch):
+def test_long_run_without_a_terminal_says_how_far_it_is(arm, run, monkeypatch):
     monkeypatch.setattr(console, "INTERVAL", 0.0)
-    assert main(["simulate", arm, "--dt", "1e-4", "--steps", "40000"]) == 0
-    lines = capsys.readouterr().err.splitlines()
-    assert "varpin: 15000 of 40000 steps" in lines
+    err = run("simulate", arm, "--dt", 1e-4, "--steps", 40000).err
+    assert "varpin: 15000 of 40000 steps" in err.splitlines()
 
 
 def test_progress_bar_on_a_terminal_vanishes_without_hiding_warnings():
@@ -305,17 +281,10 @@ def test_progress_bar_on_a_terminal_vanishes_without_hiding_warnings():
     assert "varpin" in stream.getvalue()
 
 
-def test_inspect_prints_tables_and_then_warnings(capsys):
-    assert main(["inspect", "panda", "--lock", "panda_joint7=0.5", "panda_joint6=-1", "--q", "-0.1"]) == 0
-    out, err = capsys.readouterr()
+def test_inspect_prints_tables_and_then_warnings(run):
+    out, err = run("inspect", "panda", "--lock", "panda_joint7=0.5", "panda_joint6=-1", "--q", "-0.1")
     assert err == ""
-    for words in (
-        "panda: joints",
-        "locked at -1.0",
-        "panda: links",
-        "degrees of freedom",
-        "largest step of Midpoint",
-    ):
+    for words in ("panda: joints", "locked at -1.0", "panda: links", "degrees of freedom", "largest step of Midpoint"):
         assert words in out
     lines = out.splitlines()
     first = next(k for k, line in enumerate(lines) if line.startswith("warning: "))
@@ -324,15 +293,12 @@ def test_inspect_prints_tables_and_then_warnings(capsys):
     assert naming(lines[:first], "panda_finger_joint2", "mimic", "1 * panda_finger_joint1")
 
 
-def test_robots_are_listed_with_their_joints(capsys):
-    assert main(["robots"]) == 0
-    out, err = capsys.readouterr()
+def test_robots_are_listed_with_their_joints(run):
+    out, err = run("robots")
     assert err == ""
     rows = dict(re.findall(r"^  (\S+) +(\d+)$", out, flags=re.MULTILINE))
     assert tuple(rows) == vp.robot_names()
-    assert rows["finger"] == "3"
-    assert rows["ur5"] == "6"
-    assert rows["panda"] == str(load_robot("panda").dof) == "8"
+    assert (rows["finger"], rows["ur5"], rows["panda"]) == ("3", "6", "8")
 
 
 def test_version_and_help(capsys):
@@ -340,8 +306,7 @@ def test_version_and_help(capsys):
         main(["--version"])
     assert stop.value.code == 0
     assert capsys.readouterr().out == f"varpin {vp.__version__}\n"
-    commands = "simulate", "inspect", "tradeoff", "advise"
-    for arguments in (["--help"], *([command, "--help"] for command in commands)):
+    for arguments in (["--help"], *([command, "--help"] for command in ("simulate", "inspect", "tradeoff", "advise"))):
         with pytest.raises(SystemExit) as stop:
             main(arguments)
         assert stop.value.code == 0
@@ -377,43 +342,35 @@ def test_plain_run_imports_neither_matplotlib_nor_meshcat(arm):
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=300).returncode == 0
 
 
-def test_tradeoff_prints_a_table_and_writes_files(arm, tmp_path, capsys):
+def test_tradeoff_prints_a_table_and_writes_files(arm, tmp_path, run):
     out = tmp_path / "trade"
-    options = ["--duration", "0.5", "--dt", "0.05", "0.01", "--q0", "0.3", "--repeats", "1", "--out", str(out)]
-    assert main(["tradeoff", arm, *options]) == 0
-    printed, err = capsys.readouterr()
+    options = ["--duration", 0.5, "--dt", 0.05, 0.01, "--q0", 0.3, "--repeats", 1, "--out", out]
+    printed, err = run("tradeoff", arm, *options)
     # On a slow machine it says how far it is.
     assert all(re.fullmatch(r"varpin: \d+ of \d+ runs", line) for line in err.splitlines())
     for words in ("arm", "0.5 s", "RungeKutta4", "Midpoint", "Pareto"):
         assert words in printed
     assert sorted(path.name for path in out.iterdir()) == [f"tradeoff.{kind}" for kind in ("csv", "html", "png")]
-    assert main(["tradeoff", arm, *options, "--quiet"]) == 0
-    assert capsys.readouterr().out == ""
+    assert run("tradeoff", arm, *options, "--quiet").out == ""
 
 
-def test_tradeoff_interrupted_is_status_130(arm, capsys, monkeypatch):
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
+def test_tradeoff_interrupted_is_status_130(arm, run, monkeypatch):
     monkeypatch.setattr("varpin.study.precision._measure", interrupt)
-    assert main(["tradeoff", arm, "--duration", "0.5", "--dt", "0.05", "--quiet"]) == 130
-    assert not unnamed(capsys.readouterr().err, "interrupted", "0")
+    err = run("tradeoff", arm, "--duration", 0.5, "--dt", 0.05, "--quiet", status=130).err
+    assert not unnamed(err, "interrupted", "0")
 
 
-def test_advise_says_what_to_take(arm, tmp_path, capsys):
-    options = ["--duration", "0.5", "--q0", "0.3", "--damping", "0.1"]
-    assert main(["advise", arm, "--tolerance", "1e-6", *options]) == 0
-    out, err = capsys.readouterr()
+def test_advise_says_what_to_take(arm, tmp_path, run):
+    options = ["--duration", 0.5, "--q0", 0.3, "--damping", 0.1]
+    out, err = run("advise", arm, "--tolerance", 1e-6, *options)
     assert "a minute at most" in err
     assert not unnamed(out.splitlines()[0], "dt", "1e-06", "0.5 s")
     assert out.count("  Gauss") >= 2
-    assert main(["advise", arm, "--budget", "2e-3", "--out", str(tmp_path / "advice"), *options]) == 0
+    out, _ = run("advise", arm, "--budget", 2e-3, "--out", tmp_path / "advice", *options)
     assert {path.name for path in (tmp_path / "advice").iterdir()} == {"advice.csv", "advice.html"}
-    page = (tmp_path / "advice" / "advice.html").read_text()
-    assert not unnamed(page, "0.5 s", "2 ms")
-    assert not unnamed(capsys.readouterr().out.splitlines()[0], "0.5 s", "2 ms")
-    assert main(["advise", arm, "--tolerance", "1e-20", *options]) == 3
-    assert about(capsys.readouterr().out, "out of reach")
+    for text in ((tmp_path / "advice" / "advice.html").read_text(), out.splitlines()[0]):
+        assert not unnamed(text, "0.5 s", "2 ms")
+    assert about(run("advise", arm, "--tolerance", 1e-20, *options, status=3).out, "out of reach")
 
 
 SCENE = """
@@ -445,83 +402,60 @@ def scene(tmp_path, monkeypatch):
     return "scene.toml"
 
 
-def test_scene_is_simulated(scene, tmp_path, capsys):
-    assert main(["simulate", scene, "--plot", "motion.png"]) == 0
-    out = capsys.readouterr().out
-    assert not unnamed(out, "20", "0.005 s")
+def test_scene_is_simulated(scene, tmp_path, run):
+    assert not unnamed(run("simulate", scene, "--plot", "motion.png").out, "20", "0.005 s")
     assert {path.name for path in tmp_path.iterdir()} == {"scene.toml", "kept.npz", "motion.png"}
     assert vp.Trajectory.load("kept.npz").steps == 20
 
 
-def test_scene_is_solved_saved_and_resumed(scene, tmp_path, capsys):
-    assert main(["solve", scene, "--max-iterations", "1", "--save", "part.npz"]) == console.STEP_FAILED
-    out, err = capsys.readouterr()
+def test_scene_is_solved_saved_and_resumed(scene, tmp_path, run):
+    out, err = run("solve", scene, "--max-iterations", 1, "--save", "part.npz", status=console.STEP_FAILED)
     assert "3 of 3 computed" in out
     assert "not converged" in err
     assert "varpin solve scene.toml --resume part.npz" in err
     assert "solve(problem" not in out + err
-    assert main(["solve", scene, "--resume", "part.npz", "--html", "plan.html"]) == 0
-    assert "converged" in capsys.readouterr().out
+    assert "converged" in run("solve", scene, "--resume", "part.npz", "--html", "plan.html").out
     file = vp.load_scene(scene)
-    whole, resumed = file.solve(), file.load_solution("kept.npz")
-    np.testing.assert_array_equal(whole.controls, resumed.controls)
+    np.testing.assert_array_equal(file.solve().controls, file.load_solution("kept.npz").controls)
     assert (tmp_path / "plan.html").is_file()
 
 
-def test_a_scenes_replay_shows_its_task(scene, tmp_path):
-    assert main(["solve", scene, "--html", "motion.html", "--trace", "pip", "--quiet"]) == 0
-    paths = [command["path"] for command in commands(tmp_path / "motion.html") if command["type"] == "set_object"]
-    assert any(path.startswith("/meshcat/ghost/") for path in paths)
-    traces = {path.split("/")[3] for path in paths if " motion " in path or " ghost " in path}
-    assert traces == {"0 motion pip"}  # and the ghost's joints stay
-
-
-def test_scene_is_inspected(scene, capsys):
-    assert main(["inspect", "allegro_finger"]) == 0
-    out = capsys.readouterr().out
+def test_scene_is_inspected(scene, run):
+    out = run("inspect", "allegro_finger").out
     for words in ("4 of 16", "nothing touches", "joint_12.0 at 0.0"):
         assert words in out
-    assert main(["inspect", scene]) == 0
-    assert re.search(r"gravity +none", capsys.readouterr().out)
+    assert re.search(r"gravity +none", run("inspect", scene).out)
 
 
-def test_a_plan_that_cannot_be_is_told_with_its_constraint(scene, tmp_path, capsys):
+def test_a_plan_that_cannot_be_is_told_with_its_constraint(scene, tmp_path, run):
     rule = '[[plan_constraint]]\ntype = "reach_frame"\nframe = "pip"\nposition = [9.0, 0.0, 0.0]\n[outputs]'
     (tmp_path / "scene.toml").write_text(SCENE.replace("[outputs]", rule).replace("steps = 20", "steps = 4"))
-    assert main(["solve", scene, "--quiet"]) == console.STEP_FAILED
-    err = capsys.readouterr().err
+    err = run("solve", scene, "--quiet", status=console.STEP_FAILED).err
     assert "infeasible: ReachFrame" in err
     assert "plan.reason" not in err
 
 
-def test_split_steps_are_flagged_in_the_table(arm, capsys):
-    assert main(["simulate", arm, "--integrator", "midpoint", "--dt", "0.3", "--steps", "20", "--v0", "5", "0"]) == 0
-    out, err = capsys.readouterr()
-    assert re.search(
-        r"split steps \d+ of 20, into up to \d+ parts: a smaller dt keeps the structure", " ".join(out.split())
-    )
+def test_split_steps_are_flagged_in_the_table(arm, run):
+    out, err = run("simulate", arm, "--integrator", "midpoint", "--dt", 0.3, "--steps", 20, "--v0", 5, 0)
+    flag = r"split steps \d+ of 20, into up to \d+ parts: a smaller dt keeps the structure"
+    assert re.search(flag, " ".join(out.split()))
     assert re.search(r"^varpin: warning: q is off by up to \S+ rad, .* Use integrator=", err, re.MULTILINE)
 
 
-def test_lack_of_memory_is_no_traceback(arm, capsys, monkeypatch):
+def test_lack_of_memory_is_no_traceback(arm, run, monkeypatch):
     def exhausted(*_, **__):
         raise MemoryError("Unable to allocate 7 TiB")
 
     monkeypatch.setattr("varpin.cli.runs.simulate", exhausted)
-    assert main(["simulate", arm]) == 2
-    assert not unnamed(error_of(capsys), "varpin: error", "Unable to allocate 7 TiB")
+    out, err = run("simulate", arm, status=2)
+    assert (out, len(err.splitlines())) == ("", 1)
+    assert not unnamed(err, "varpin: error", "Unable to allocate 7 TiB")
 
 
-def test_inspect_takes_what_simulate_refuses(tmp_path, capsys):
-    path = tmp_path / "empty.urdf"
-    path.write_text(
-        '<robot name="empty"><link name="base"/><link name="ghost"/><joint name="hinge" type="continuous">'
-        '<parent link="base"/><child link="ghost"/><axis xyz="0 0 1"/></joint></robot>'
-    )
-    assert main(["simulate", str(path)]) == 2
-    assert not unnamed(error_of(capsys), "'hinge'")
-    assert main(["inspect", str(path)]) == 0
-    out = capsys.readouterr().out
+def test_inspect_takes_what_simulate_refuses(tmp_path, run):
+    path = write_urdf(tmp_path, '<link name="ghost"/>', joint("hinge", "base", "ghost", kind="continuous"))
+    assert not unnamed(run("simulate", path, status=2).err, "'hinge'")
+    out = run("inspect", path).out
     assert not unnamed(out, "singular")
     assert naming(out.splitlines(), "warning", "'ghost'", "'hinge'")
 

@@ -1,4 +1,4 @@
-"""The documentation says what is so: its code runs, its links lead somewhere, and the API is complete."""
+"""The documentation and the README say what is so: their code runs, links lead somewhere, and the API is complete."""
 
 import ast
 import inspect
@@ -13,6 +13,7 @@ import pytest
 import varpin as vp
 from varpin.cli import command
 from varpin.io.scenefile import scenes
+from varpin.simulation import limits
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "docs" / "extensions"))
 import page_code
@@ -47,6 +48,12 @@ def blocks(page, language):
     return re.findall(rf"^```{language}\n(.*?)^```$", text_of(page), re.M | re.S)
 
 
+def run(*words, cwd):
+    done = subprocess.run([sys.executable, *words], cwd=cwd, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
 @pytest.mark.parametrize(
     "page",
     [pytest.param(page, marks=[] if page in QUICK else pytest.mark.slow) for page in PAGES if blocks(page, "python")],
@@ -54,9 +61,7 @@ def blocks(page, language):
 def test_a_page_runs_from_top_to_bottom(page, tmp_path):
     if page in NEEDS:
         pytest.importorskip(NEEDS[page])
-    code = "\n".join(blocks(page, "python"))
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    run("-c", "\n".join(blocks(page, "python")), cwd=tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir() if path.suffix == ".html") == sorted(MADE.get(page, []))
 
 
@@ -235,3 +240,33 @@ def test_the_list_of_slow_tests_names_tests(request):
     if request.config.args_source is not pytest.Config.ArgsSource.TESTPATHS:
         pytest.skip("some tests are not collected")
     assert names <= {item.nodeid for item in request.session.items}
+
+
+def test_the_readme_has_only_blocks_that_are_run():
+    assert set(re.findall(r"^```(\w+)$", text_of(README), re.M)) == {"python", "bash", "text"}
+    assert len(blocks(README, "bash")) == 2
+
+
+@pytest.mark.parametrize("number", range(len(blocks(README, "python"))))
+def test_a_block_of_the_readme_runs(number, tmp_path):
+    code = blocks(README, "python")[number]
+    done = run("-c", code, cwd=tmp_path)
+    # What is shown first asks nothing of a robot that its description forbids.
+    assert not [kind for kind in limits.KINDS if kind in done.stderr], done.stderr
+    if "replay" in code:
+        assert list(tmp_path.glob("*.html"))
+    if "verify" in code:
+        own = done.stdout[done.stdout.index("                          cost") :]
+        (table,), cost = blocks(README, "text"), r" (\d\.\d{6}e-07)"
+        for found, shown in zip(own.split(), table.split(), strict=False):
+            # What is down at rounding is another number on another machine.
+            assert found == shown or float(found) == pytest.approx(float(shown), rel=0.5, abs=1e-12)
+        found, shown = ([float(text) for text in re.findall(cost, part)[:3]] for part in (own, table))
+        assert found == pytest.approx(shown, rel=1e-3)
+
+
+def test_the_readme_s_main_command(tmp_path):
+    """The first command's own work, with this interpreter for the one it installs; .ci/run runs it whole."""
+    words = blocks(README, "bash")[0].replace("\\\n", " ").split("&& .venv/bin/varpin ")[1]
+    run("-m", "varpin", *words.split(), cwd=tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"finger.html", "finger.npz", "finger.png"}

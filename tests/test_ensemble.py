@@ -15,9 +15,9 @@ ARRAYS = ("q", "v", "p", "u", "energy")
 START = {"q0": [0.3, -0.2], "v0": [0.0, 1.0]}
 
 
-def make_scene(strength=0.3, **options):
-    noise = vp.AdditiveNoise(strength) + vp.ControlNoise(0.2) + vp.StateNoise(0.1)
-    return vp.Scene(vp.planar_chain(2), damping=0.2, stiffness=3.0, noise=noise, **options)
+def make_scene():
+    noise = vp.AdditiveNoise(0.3) + vp.ControlNoise(0.2) + vp.StateNoise(0.1)
+    return vp.Scene(vp.planar_chain(2), damping=0.2, stiffness=3.0, noise=noise)
 
 
 def run(scene=None, **options):
@@ -31,6 +31,21 @@ def same_statistics(one, other, tolerance=0.0):
         np.testing.assert_allclose(a, b, rtol=0, atol=tolerance, equal_nan=True)
 
 
+def same_paths(some, whole):
+    """The paths of an ensemble are the first ones of another, to the last bit."""
+    for name in ARRAYS:
+        mine, other = getattr(some, name), getattr(whole, name)
+        assert (mine is None) == (other is None)
+        assert mine is None or mine.tobytes() == other[: len(mine)].tobytes()
+    assert some.t.tobytes() == whole.t.tobytes()
+
+
+def same_ensembles(one, other):
+    same_statistics(one, other)
+    same_paths(one, other)
+    assert (one.failures, one.warnings) == (other.failures, other.warnings)
+
+
 @pytest.mark.parametrize("kick", ["left", "split"])
 def test_same_bytes_for_any_number_of_workers(kick):
     integrator, calls = vp.Midpoint(kick=kick), []
@@ -38,9 +53,7 @@ def test_same_bytes_for_any_number_of_workers(kick):
     seven = run(paths=200, workers=7, integrator=integrator, progress=lambda *done: calls.append(done))
     assert calls == [(96, 200), (192, 200), (200, 200)]
     for other in (two, seven):
-        for name in ARRAYS:
-            assert getattr(other, name).tobytes() == getattr(one, name).tobytes()
-        same_statistics(other, one)
+        same_ensembles(other, one)
 
 
 def test_a_few_long_paths_are_work_for_four():
@@ -51,10 +64,12 @@ def test_a_few_long_paths_are_work_for_four():
 
 def test_same_bytes_for_one_path_or_a_thousand():
     many, few, one = (run(paths=paths) for paths in (1000, 45, 1))
-    for name in ARRAYS:
-        assert getattr(few, name).tobytes() == getattr(many, name)[:45].tobytes()
-        assert getattr(one, name).tobytes() == getattr(many, name)[:1].tobytes()
+    same_paths(few, many)
+    same_paths(one, many)
     assert len(np.unique(many.q[:, -1, 0])) == 1000
+    assert not one.statistics.covariance.any()
+    assert not one.statistics.energy_deviation.any()
+    assert (one.statistics.count == 1).all()
 
 
 def controls_of(kind):
@@ -68,12 +83,11 @@ def controls_of(kind):
 @pytest.mark.parametrize("kick", ["left", "split"])
 @pytest.mark.parametrize("kind", ["constant", "feedback", "linear"])
 def test_paths_are_simulations_from_the_children_of_the_generator(kind, kick):
-    """Each from its own start."""
-    scene, q0 = make_scene(), np.random.default_rng(0).normal(size=(40, 2))
+    scene, (q0, v0) = make_scene(), np.random.default_rng(0).normal(size=(2, 40, 2))
     options = {"dt": 0.01, "steps": 50, "controls": controls_of(kind), "integrator": vp.Midpoint(kick=kick)}
-    end = run(scene, rng=np.random.default_rng(7) if kind == "linear" else 7, q0=q0, **options)
+    end = run(scene, rng=np.random.default_rng(7) if kind == "linear" else 7, q0=q0, v0=v0, **options)
     for path, child in enumerate(np.random.default_rng(7).spawn(40)):
-        alone = vp.simulate(scene, q0[path], START["v0"], rng=child, **options)
+        alone = vp.simulate(scene, q0[path], v0[path], rng=child, **options)
         for name in ARRAYS:
             assert getattr(end, name)[path].tobytes() == getattr(alone, name).tobytes()
     np.testing.assert_array_equal(end.t, alone.t)
@@ -87,27 +101,19 @@ def test_without_noise_the_integrator_is_that_of_simulate():
     assert not end.statistics.energy_deviation.any()
 
 
-def expected_statistics(x, energy, levels):
-    """By NumPy, node by node, over the paths that are not NaN there."""
-    for j in range(x.shape[1]):
-        good = ~np.isnan(energy[:, j])
-        deviation = energy[good, j].std(ddof=1)
-        quantiles = np.quantile(x[good, j], levels, axis=0)
-        yield good.sum(), x[good, j].mean(axis=0), np.cov(x[good, j].T), quantiles, energy[good, j].mean(), deviation
-
-
 def check_statistics(end):
-    own = end.statistics
-    x = np.concatenate([end.q, end.p], axis=2)
-    for j, (count, mean, covariance, quantiles, energy, deviation) in enumerate(
-        expected_statistics(x, end.energy, own.levels)
-    ):
-        assert own.count[j] == count
-        np.testing.assert_allclose(own.mean[j], mean, rtol=0, atol=1e-13)
+    """By NumPy, node by node, over the paths that are not NaN there."""
+    own, x = end.statistics, np.concatenate([end.q, end.p], axis=2)
+    for j in range(x.shape[1]):
+        good = ~np.isnan(end.energy[:, j])
+        at, energy = x[good, j], end.energy[good, j]
+        covariance = np.cov(at.T)
+        assert own.count[j] == good.sum()
+        np.testing.assert_allclose(own.mean[j], at.mean(axis=0), rtol=0, atol=1e-13)
         np.testing.assert_allclose(own.covariance[j], covariance, rtol=0, atol=1e-13 * max(1, np.abs(covariance).max()))
-        np.testing.assert_array_equal(own.quantiles[:, j], quantiles)
-        assert own.energy_mean[j] == pytest.approx(energy, rel=1e-13)
-        assert own.energy_deviation[j] == pytest.approx(deviation, rel=1e-10, abs=1e-12)
+        np.testing.assert_array_equal(own.quantiles[:, j], np.quantile(at, own.levels, axis=0))
+        assert own.energy_mean[j] == pytest.approx(energy.mean(), rel=1e-13)
+        assert own.energy_deviation[j] == pytest.approx(energy.std(ddof=1), rel=1e-10, abs=1e-12)
 
 
 def test_statistics_are_those_of_the_stored_paths():
@@ -190,17 +196,12 @@ def test_interruption_keeps_what_is_done():
     kept = len(part.q)
     assert 192 <= kept < 3000
     assert f"{kept} paths" in str(caught.value)
-    assert part.t.tobytes() == whole.t.tobytes()
-    for name in ARRAYS:
-        assert getattr(part, name).tobytes() == getattr(whole, name)[:kept].tobytes()
+    same_paths(part, whole)
     check_statistics(part)
     assert part.statistics.count.tolist() == [kept] * 51
 
 
 def test_interruption_before_anything_is_done(monkeypatch):
-    def stop(*given):
-        raise KeyboardInterrupt
-
     monkeypatch.setattr(varpin.ensemble.run, "simulate_paths", stop)
     with refused(vp.EnsembleInterrupted, "0") as caught:
         run()
@@ -216,12 +217,13 @@ def test_quantiles_of_very_many_paths_are_those_of_the_first(monkeypatch):
     np.testing.assert_array_equal(found.mean, whole.statistics.mean)
 
 
+COARSE = {"dt": 0.05, "steps": 40, "controls": None, "integrator": vp.ExplicitEuler(), "store": False}
+
+
 def test_a_coarse_step_is_told_of(caplog):
-    scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(1e-2))
-    coarse = {"dt": 0.05, "steps": 40, "controls": None, "integrator": vp.ExplicitEuler(), "store": False}
+    scene = fragile_scene(2)
     with caplog.at_level(logging.WARNING, "varpin.ensemble"):
-        end = run(scene, **coarse)
-        again = run(scene, **coarse)
+        end, again = run(scene, **COARSE), run(scene, **COARSE)
     assert naming(about(end.warnings, "error"), "joint2", "varpin.Gauss(3)")
     assert all(warning.startswith("path ") for warning in end.warnings)
     assert again.warnings == end.warnings
@@ -231,34 +233,27 @@ def test_a_coarse_step_is_told_of(caplog):
     for warning in end.warnings:
         assert f"warning: {warning}" in str(end)
         assert about(end._repr_html_(), "error")
-    assert run(vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(1e-2)), dt=1e-3).warnings == ()
+    assert run(fragile_scene(2), dt=1e-3).warnings == ()
 
 
-COARSE = {"dt": 0.05, "steps": 40, "controls": None, "integrator": vp.ExplicitEuler(), "store": False}
+def stop(*given):
+    raise KeyboardInterrupt
 
 
 def test_an_interrupted_ensemble_carries_warnings(monkeypatch):
     """Those of the same ensemble of as many paths; without a look after a second Ctrl-C."""
-
-    def interrupt(done, total):
-        raise KeyboardInterrupt
-
-    def stop(*given):
-        raise KeyboardInterrupt
-
-    scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(1e-2))
+    scene = fragile_scene(2)
     with pytest.raises(vp.EnsembleInterrupted) as caught:
-        run(scene, **COARSE | {"paths": 300}, progress=interrupt)
+        run(scene, **COARSE | {"paths": 300}, progress=lambda done, total: stop())
     part = caught.value.ensemble
     assert part.warnings == run(scene, **COARSE | {"paths": int(part.statistics.count[0])}).warnings != ()
     monkeypatch.setattr(varpin.ensemble.statistics, "examine", stop)
     with pytest.raises(vp.EnsembleInterrupted) as caught:
-        run(scene, **COARSE | {"paths": 300}, progress=interrupt)
+        run(scene, **COARSE | {"paths": 300}, progress=lambda done, total: stop())
     assert caught.value.ensemble.warnings == ()
 
 
 def test_the_paths_that_stand_out_are_looked_at():
-    """One of 200 starts so fast that its steps are taken in parts."""
     v0 = np.zeros((200, 2))
     v0[137] = 60.0
     scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(1e-3))
@@ -269,50 +264,29 @@ def test_the_paths_that_stand_out_are_looked_at():
 CUSTOM = vp.CustomNoise(lambda q, v, u: np.eye(2), 2)
 
 
+def policy(*shape):
+    return vp.LinearPolicy(np.ones(shape[:2]), np.ones(shape), np.ones((shape[0], shape[2])))
+
+
 @pytest.mark.parametrize(
     ("options", "facts"),
     [
         ({"scene": "chain"}, ("scene", "varpin.Scene", "str")),
         ({"scene": vp.Scene(vp.planar_chain(2), noise=CUSTOM)}, "noise"),
-        ({"dt": 0.0}, ("dt", "0.0")),
         ({"steps": 10**14}, ("100000000000000", "40")),
         ({"paths": 0}, ("paths", "1", "0")),
-        ({"rng": -3}, ("rng", "0", "-3")),
         ({"q0": np.zeros((39, 2))}, ("q0", "(40, 2)", "(39, 2)")),
-        ({"v0": [0.0, np.nan]}, ("v0[1]", "nan")),
-        ({"controls": lambda t, q, v: q}, ("simulate", "law")),
-        ({"integrator": "midpoint"}, "integrator"),
         ({"quantiles": [0.5, 1.5]}, ("quantiles", "[0, 1]", "[0.5, 1.5]")),
-        ({"quantiles": 0.5}, ("quantiles", "[0, 1]", "0.5")),
         ({"duration": 1.0}, ("dt", "steps", "duration", "all three")),
         ({"workers": 0}, ("workers", "1", "0")),
+        ({"controls": policy(49, 2, 4)}, ("49", "1", "50")),
+        ({"controls": policy(50, 1, 4)}, ("gains", "(N, 2, 4)", "(50, 1, 4)")),
+        ({"controls": policy(50, 2, 6)}, ("gains", "(N, 2, 4)", "(50, 2, 6)")),
     ],
 )
 def test_bad_input(options, facts):
     with refused(vp.InputError, facts):
         run(**options)
-
-
-@pytest.mark.parametrize("kick", [pytest.param("left", marks=pytest.mark.slow), "split"])
-def test_small_noise_has_the_predicted_covariance(kick):
-    """Mean and covariance of 20 000 paths against :func:`varpin.propagate_moments` around the quiet motion."""
-    paths, strength, integrator = 20_000, 2e-4, vp.Midpoint(kick=kick)
-    noise = vp.AdditiveNoise(strength) + vp.StateNoise(strength) + vp.ControlNoise(strength)
-    scene = vp.Scene(vp.planar_chain(2), damping=0.2, stiffness=3.0, noise=noise)
-    options = {"dt": 0.01, "controls": [0.3, -0.1], "steps": 50, "integrator": integrator}
-    quiet = vp.simulate(scene, *START.values(), **options)
-    moments = vp.propagate_moments(vp.linearize(scene, quiet, integrator=integrator))
-    own = vp.simulate_ensemble(scene, *START.values(), paths=paths, rng=5, store=False, **options).statistics
-    for j in (1, 10, 50):
-        P = moments.covariance[j]
-        variances = np.diag(P)
-        x = np.concatenate([quiet.q[j], quiet.p[j]])
-        # Of Gaussian samples: var(mean) = P_aa / N, var(P_ab) = (P_aa P_bb + P_ab^2) / N.
-        assert (np.abs(own.mean[j] - x) < 4.0 * np.sqrt(variances / paths)).all()
-        error = np.sqrt((np.outer(variances, variances) + P**2) / paths)
-        assert (np.abs(own.covariance[j] - P) < 4.0 * error).all()
-        # A covariance tenth as large again would show.
-        assert (0.1 * variances > 4.0 * np.diag(error)).all()
 
 
 @pytest.mark.filterwarnings("error")
@@ -333,43 +307,9 @@ def test_a_file_gives_the_ensemble_back(store, tmp_path):
     path = found.save(tmp_path / "ensemble.npz")
     again = vp.Ensemble.load(path)
     assert found.failures
-    assert (str(again), again.failures, again.warnings) == (str(found), found.failures, found.warnings)
-    for name in ("t", *ARRAYS):
-        np.testing.assert_array_equal(getattr(again, name), getattr(found, name))
-    same_statistics(again, found)
+    assert str(again) == str(found)
+    same_ensembles(again, found)
     with np.load(path) as members:
         np.savez(path, **dict(members) | {"t": np.zeros(3)})
     with pytest.raises(vp.FileError, match="instead of float64"):
         vp.Ensemble.load(path)
-
-
-def test_each_path_may_have_its_own_start():
-    q0, v0 = np.random.default_rng(0).normal(size=(2, 40, 2))
-    end = run(q0=q0, v0=v0)
-    np.testing.assert_array_equal(end.q[:, 0], q0)
-    np.testing.assert_array_equal(end.v[:, 0], v0)
-    for path, child in enumerate(np.random.default_rng(7).spawn(40)):
-        alone = vp.simulate(make_scene(), q0[path], v0[path], dt=0.01, steps=50, rng=child, controls=[0.3, -0.1])
-        assert end.p[path].tobytes() == alone.p.tobytes()
-
-
-def test_one_path_has_no_covariance():
-    alone = run(paths=1).statistics
-    assert not alone.covariance.any()
-    assert not alone.energy_deviation.any()
-    assert (alone.count == 1).all()
-
-
-@pytest.mark.parametrize(
-    ("shape", "facts"),
-    [
-        ((49, 2, 4), ("49", "1", "50")),
-        ((50, 1, 4), ("gains", "(N, 2, 4)", "(50, 1, 4)")),
-        ((50, 2, 6), ("gains", "(N, 2, 4)", "(50, 2, 6)")),
-    ],
-)
-def test_policies_that_do_not_fit_the_scene(shape, facts):
-    steps, m, size = shape
-    policy = vp.LinearPolicy(np.ones((steps, m)), np.ones(shape), np.ones((steps, size)))
-    with refused(vp.InputError, facts):
-        run(controls=policy)

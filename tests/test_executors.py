@@ -5,14 +5,17 @@ import multiprocessing
 import os
 import pickle
 import signal
+import tracemalloc
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 
+import coal
 import numpy as np
+import pinocchio as pin
 import pytest
 from findings import about
 from refusals import refused
-from test_ensemble import ARRAYS, make_scene, run, same_statistics
+from test_ensemble import make_scene, run, same_ensembles, same_paths
 
 import varpin as vp
 from varpin.support.executors import executing, in_order
@@ -34,27 +37,16 @@ class Shipping(Executor):
     """Takes tasks and gives results as bytes, in this process, and counts them."""
 
     def __init__(self):
-        self.sent, self.returned, self.most, self.answers = 0, 0, 0, []
+        self.sent, self.returned, self.most = 0, 0, 0
 
     def submit(self, fn, /, *args, **kwargs):
         task = pickle.dumps((fn, args, kwargs))
         fn, args, kwargs = pickle.loads(task)
         answer = pickle.dumps(fn(*args, **kwargs))
         self.sent, self.returned, self.most = self.sent + 1, self.returned + len(answer), max(self.most, len(task))
-        self.answers.append(len(answer))
         done = Future()
         done.set_result(pickle.loads(answer))
         return done
-
-
-def same_ensembles(one, other):
-    same_statistics(one, other)
-    assert one.failures == other.failures
-    assert one.warnings == other.warnings
-    for name in ARRAYS:
-        a, b = getattr(one, name), getattr(other, name)
-        assert (a is None) == (b is None)
-        assert a is None or a.tobytes() == b.tobytes()
 
 
 @pytest.mark.parametrize("store", [True, False])
@@ -85,35 +77,27 @@ def test_nothing_comes_back_that_was_not_asked_for():
     assert whole.returned > 8 * paths * steps * 9
 
 
-@pytest.fixture
-def meshed():
-    """A robot of two joints, with a mesh of megabytes that came along in memory."""
-    import coal  # noqa: PLC0415
-    import pinocchio as pin  # noqa: PLC0415
-
-    visuals = pin.GeometryModel()
-    mesh = coal.BVHModelOBBRSS()
+def test_meshes_stay_at_home():
+    visuals, mesh = pin.GeometryModel(), coal.BVHModelOBBRSS()
     mesh.beginModel(20_000, 60_000)
     mesh.addVertices(np.random.default_rng(0).normal(size=(60_000, 3)))
     mesh.endModel()
     visuals.addGeometryObject(pin.GeometryObject("mesh", 1, pin.SE3.Identity(), mesh))
-    return vp.load_robot(pin.RobotWrapper(vp.planar_chain(2).model.copy(), visual_model=visuals))
-
-
-def test_meshes_stay_at_home(meshed):
-    scene, shipping = vp.Scene(meshed, noise=vp.AdditiveNoise(0.1)), Shipping()
+    robot = vp.load_robot(pin.RobotWrapper(vp.planar_chain(2).model.copy(), visual_model=visuals))
+    scene, shipping = vp.Scene(robot, noise=vp.AdditiveNoise(0.1)), Shipping()
     run(scene, executor=shipping)
     assert shipping.most < 50_000
     assert scene.robot.visuals is not None
 
 
-def plan_of(scene, **options):
-    cost = vp.ControlCost(1e-2) + vp.Terminal(vp.TrackingCost([0.5, 0.2], 10.0))
-    return vp.solve(vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], dt=0.02, steps=20), **options)
+def plan_of(scene, start=(0.0, 0.0), goal=(0.5, 0.2), **grid):
+    cost = vp.ControlCost(1e-2) + vp.TrackingCost(goal, 0.1) + vp.Terminal(vp.TrackingCost(goal, 10.0))
+    given = {"dt": 0.02, "steps": 20} | grid
+    return vp.solve(vp.OptimalControlProblem(scene, cost, start, [0.0, 0.0], **given), max_iterations=2)
 
 
 def test_monte_carlo_on_processes(spawned):
-    plan = plan_of(make_scene(), max_iterations=3)
+    plan = plan_of(make_scene())
     calls = []
     found = plan.monte_carlo(300, 1, executor=spawned, progress=lambda *done: calls.append(done))
     assert found == plan.monte_carlo(300, 1, workers=2) == plan.monte_carlo(300, 1, workers=1)
@@ -124,19 +108,13 @@ def test_monte_carlo_on_processes(spawned):
 
 
 def test_references_in_place_are_sampled_before_they_are_sent(spawned):
-    cost = vp.TrackingCost(lambda t: [0.1 * t, 0.0]) + vp.ControlCost(1e-2)
-    problem = vp.OptimalControlProblem(make_scene(), cost, [0.0, 0.0], [0.0, 0.0], dt=0.02, steps=10)
-    plan = vp.solve(problem, max_iterations=2)
+    plan = plan_of(make_scene(), goal=lambda t: [0.1 * t, 0.0])
     assert plan.monte_carlo(50, 1, executor=spawned) == plan.monte_carlo(50, 1)
 
 
 def test_monte_carlo_tells_of_what_its_paths_do(caplog):
     scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(0.1))
-    cost = vp.ControlCost(1e-2) + vp.Terminal(vp.TrackingCost([0.5, 0.2], 10.0))
-    problem = vp.OptimalControlProblem(
-        scene, cost, [1.5, 0.0], [0.0, 0.0], dt=0.1, steps=20, integrator=vp.ExplicitEuler()
-    )
-    plan = vp.solve(problem, max_iterations=2)
+    plan = plan_of(scene, [1.5, 0.0], dt=0.1, integrator=vp.ExplicitEuler())
     with caplog.at_level(logging.WARNING, "varpin.control.monte_carlo"):
         found = plan.monte_carlo(60, 0)
     assert about(found.warnings, "error")
@@ -153,25 +131,12 @@ def test_monte_carlo_tells_of_what_its_paths_do(caplog):
     assert about(found._repr_html_(), "error")
 
 
-class Silent(Executor):
-    """Does tasks when they are asked for, and says nothing of its workers."""
-
-    def __init__(self):
-        self.begun = 0
-
-    def submit(self, fn, /, *args, **kwargs):
-        self.begun += 1
-        done = Future()
-        done.set_result(fn(*args, **kwargs))
-        return done
-
-
 @pytest.mark.parametrize(("result_bytes", "ahead"), [(0, 256), (2**26, 32), (2**40, 2)])
 def test_tasks_ahead_are_bounded_by_number_and_by_bytes(result_bytes, ahead):
-    executor = Silent()
+    executor = Shipping()
     results = in_order(executor, abs, range(5000), result_bytes=result_bytes)
     assert next(results) == 0
-    assert executor.begun == ahead
+    assert executor.sent == ahead
     results.close()
 
 
@@ -183,13 +148,13 @@ def deadly(q, v):
 
 def test_paths_that_were_finished_before_a_worker_was_lost_are_kept():
     scene, q0 = vp.Scene(vp.planar_chain(1), forces=[vp.CustomForce(deadly)]), np.linspace(-1.0, 0.0, 300)[:, None]
-    q0[-1] = 2.1
+    q0[-1], options = 2.1, {"dt": 0.01, "steps": 20, "integrator": vp.ExplicitEuler()}
     with ProcessPoolExecutor(1) as pool, refused(vp.WorkersLost, "lost", ".ensemble") as caught:
-        vp.simulate_ensemble(scene, q0, [0.0], paths=300, rng=0, dt=0.01, steps=20, executor=pool)
+        vp.simulate_ensemble(scene, q0, [0.0], paths=300, rng=0, executor=pool, **options)
     assert isinstance(caught.value.__cause__, BrokenProcessPool)
     kept = caught.value.ensemble
     assert 100 < len(kept.q) < 300
-    motion = vp.simulate(scene, q0[7], [0.0], dt=0.01, steps=20, check=False)
+    motion = vp.simulate(scene, q0[7], [0.0], check=False, **options)
     assert kept.q[7].tobytes() == motion.q.tobytes()
     assert pickle.loads(pickle.dumps(caught.value)).ensemble.q.shape == kept.q.shape
 
@@ -205,9 +170,8 @@ def test_workers_or_executor(spawned):
 
 @pytest.mark.slow
 def test_a_dask_cluster_gives_the_bytes_of_threads():
-    """Two processes of a local cluster, of which one is killed on the way."""
     distributed = pytest.importorskip("distributed")
-    plan = plan_of(make_scene(), max_iterations=3)
+    plan = plan_of(make_scene())
     with (
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
         distributed.Client(cluster) as client,
@@ -230,7 +194,6 @@ def test_a_dask_cluster_gives_the_bytes_of_threads():
 @pytest.mark.slow
 def test_many_paths_need_no_more_memory_than_few():
     """The peak of this process while 40 000 paths of 100 steps come back from a pool, over that of 4000."""
-    import tracemalloc  # noqa: PLC0415
 
     def peak(paths):
         tracemalloc.start()
@@ -270,7 +233,6 @@ def test_interruption_on_processes_keeps_what_is_done(spawned):
     with pytest.raises(vp.EnsembleInterrupted) as caught:
         run(paths=3000, executor=spawned, progress=interrupt)
     part = caught.value.ensemble
-    done = len(part.q)
-    assert 200 < done < 3000
-    assert part.q.tobytes() == run(paths=done).q.tobytes()
+    assert 200 < len(part.q) < 3000
+    same_paths(part, run(paths=len(part.q)))
     assert run(executor=spawned).statistics.count[0] == 40

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
+from mechanisms import mass_matrix
 from refusals import naming, refused, unnamed
 
 import varpin as vp
@@ -12,6 +12,9 @@ from varpin.show.inspection import inspect_robot
 
 ROD = '<mass value="1"/><origin xyz="0.5 0 0"/><inertia ixx="0.001" ixy="0" ixz="0" iyy="0.083" iyz="0" izz="0.083"/>'
 LIMIT = '<limit lower="-1" upper="2" effort="10" velocity="3"/>'
+
+
+ODD = "non-physical inertia"
 
 
 def inertial(mass: float, ixx: float, iyy: float, izz: float, x: float = 0.5) -> str:
@@ -54,22 +57,10 @@ def test_sound_arm_gives_no_warning_and_its_figures(tmp_path):
         ((ROD, None), ("massless", "'link2'", "'joint2'", "nothing")),
         ((None, ROD), ("massless", "'link1'", "'joint1'", "only")),
         ((ROD, inertial(1, 0, 0, 0)), ("point mass", "'link2'", "1 kg")),
-        (
-            (ROD, inertial(1, -0.02, 0.08, 0.08)),
-            ("non-physical inertia", "'link2'", "positive definite", "-0.02, 0.08, 0.08"),
-        ),
-        (
-            (ROD, inertial(1, 0.01, 0.02, 0.08)),
-            ("non-physical inertia", "'link2'", "triangle inequality", "0.08 > 0.01 + 0.02"),
-        ),
-        (
-            (ROD, inertial(1, 0.08, 0.08, 0.08, x=500)),
-            ("centre of mass", "'link2'", "500 m", "1 m"),
-        ),
-        (
-            (ROD, inertial(1, 80, 80, 80)),
-            ("radius of gyration", "'link2'", "8.94 m"),
-        ),
+        ((ROD, inertial(1, -0.02, 0.08, 0.08)), (ODD, "'link2'", "positive definite", "-0.02, 0.08, 0.08")),
+        ((ROD, inertial(1, 0.01, 0.02, 0.08)), (ODD, "'link2'", "triangle inequality", "0.08 > 0.01 + 0.02")),
+        ((ROD, inertial(1, 0.08, 0.08, 0.08, x=500)), ("centre of mass", "'link2'", "500 m", "1 m")),
+        ((ROD, inertial(1, 80, 80, 80)), ("radius of gyration", "'link2'", "8.94 m")),
         ((ROD, inertial(1, 1e-7, 1e-7, 1e-7)), ("inertia", "small", "'link2'", "1 kg")),
     ],
 )
@@ -97,31 +88,21 @@ def test_one_line_for_each_kind(tmp_path):
 def test_singular_mass_matrix_names_the_joint_and_has_no_largest_step(tmp_path):
     report = inspect_robot(write_arm(tmp_path, ROD, None))
     assert naming(report.warnings, "mass matrix", "singular", "'joint2'")
-    assert report.condition == np.inf
-    assert report.largest_step is None
-    with pytest.raises(vp.SingularMassMatrix):
-        vp.load_robot(tmp_path / "arm.urdf")
+    assert (report.condition, report.largest_step) == (np.inf, None)
 
 
 def test_condition_number_is_that_of_the_mass_matrix():
     q = [0.1, -0.4, 0.8, 0.2, 0.5, -0.3, 0.0]
     report = inspect_robot("z1", q=q)
-    model = pin.Model(report.robot.model)
-    M = pin.crba(model, model.createData(), np.array(q))
-    M = np.triu(M) + np.triu(M, 1).T
+    M = mass_matrix(report.robot, np.array(q), report.robot.model.createData())
     scale = np.diag(np.diag(M) ** -0.5)
     assert report.condition == pytest.approx(np.linalg.cond(scale @ M @ scale))
 
 
 def test_ill_conditioned_mass_matrix_is_said(tmp_path):
-    # Two joints on one axis: only the first link's own inertia tells them apart.
-    text = f'<link name="base"/><link name="disc"><inertial>{inertial(1e-3, 1e-7, 1e-7, 1e-7, x=0)}</inertial></link>'
-    text += f'<link name="arm"><inertial>{inertial(1, 0.01, 0.5, 0.5)}</inertial></link>'
-    for name, parent, child in (("lower", "base", "disc"), ("upper", "disc", "arm")):
-        text += f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
-        text += f'<axis xyz="0 1 0"/>{LIMIT}</joint>'
-    path = tmp_path / "coaxial.urdf"
-    path.write_text(f'<robot name="coaxial">{text}</robot>')
+    """Two joints on one axis: only the first link's own inertia tells them apart."""
+    path = write_arm(tmp_path, inertial(1e-3, 1e-7, 1e-7, 1e-7, x=0), inertial(1, 0.01, 0.5, 0.5))
+    path.write_text(path.read_text().replace('<origin xyz="1 0 0"/><axis', '<origin xyz="0 0 0"/><axis'))
     report = inspect_robot(path)
     assert naming(report.warnings, "mass matrix", "ill-conditioned")
     # M = [[I + e, I], [I, I]] with I = 0.75 and e = 1e-7.

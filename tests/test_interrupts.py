@@ -1,7 +1,5 @@
 """Ctrl-C in a process of its own: answered at once, and what is being written is written."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -109,15 +107,20 @@ def test_the_first_while_writing_finishes_the_file(tmp_path):
     assert not figure.exists()
 
 
-def test_the_second_ends_it(tmp_path):
+@pytest.mark.parametrize(
+    ("run", "words", "seconds"),
+    [(0.1, "WRITING", 10.0), pytest.param(3.0, "what is done is kept", 2.0, marks=pytest.mark.slow)],
+    ids=["while it writes", "within one call"],
+)
+def test_the_second_ends_it(run, words, seconds, tmp_path):
     path = tmp_path / "a.npz"
-    command = Command(*LONG, "--save", str(path), run=0.1, save=60.0)
+    command = Command(*LONG, "--save", str(path), run=run, save=60.0)
     command.wait_for("RUNNING")
     command.interrupt()
-    command.wait_for("WRITING")
+    command.wait_for(words)
     asked = command.interrupt()
     assert command.end() == 130
-    assert time.monotonic() - asked < 10.0
+    assert time.monotonic() - asked < seconds
     assert not path.exists()
     assert not any("Traceback" in line for line in command.lines)
 
@@ -134,19 +137,6 @@ def loading(*_, **__):
 varpin.cli.runs.motion_of = loading
 sys.exit(main(sys.argv[1:]))
 """
-
-
-@pytest.mark.slow
-def test_two_within_one_call_end_it_at_once(tmp_path):
-    path = tmp_path / "a.npz"
-    command = Command(*LONG, "--save", str(path), run=3.0, save=60.0)
-    command.wait_for("RUNNING")
-    command.interrupt()
-    command.wait_for("what is done is kept")
-    asked = command.interrupt()
-    assert command.end() == 130
-    assert time.monotonic() - asked < 2.0
-    assert not path.exists()
 
 
 def test_before_a_run_it_only_stops():

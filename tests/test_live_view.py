@@ -1,18 +1,17 @@
 """Motions and plans in a real browser while they are computed."""
 
+import contextlib
 import itertools
 import logging
 import time
 
 import numpy as np
 import pytest
-from chromium import names, severe, shapes_stand, wait_until
+from chromium import connect, names, severe, shapes_stand, wait_until
 from refusals import refused
 
 import varpin as vp
 from varpin.show.replay import live, page
-
-ONLINE = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
 
 
 @pytest.fixture(scope="module")
@@ -22,26 +21,15 @@ def scene():
 
 @pytest.fixture
 def opened():
-    """Views that are closed after the test."""
-    views = []
-
-    def make(*given, **options):
-        views.append(vp.LiveView(*given, open=False, **options))
-        return views[-1]
-
-    yield make
-    for view in views:
-        view.close()
+    with contextlib.ExitStack() as stack:
+        yield lambda *given, **options: stack.enter_context(vp.LiveView(*given, open=False, **options))
 
 
 @pytest.fixture
 def seen(opened, browser):
-    """Views that the browser shows."""
-
     def make(*given, **options):
         view = opened(*given, **options)
-        browser.get_log("browser")
-        browser.execute_cdp_cmd("Network.emulateNetworkConditions", ONLINE)
+        connect(browser, online=True)
         browser.get(view.url)
         assert view.wait(60.0)
         return view
@@ -156,36 +144,36 @@ def test_a_browser_is_started_and_waited_for(scene, monkeypatch, caplog, capfd):
 
 
 def test_says_what_does_not_fit(opened, scene):
-    view = opened(scene)
     problem = vp.OptimalControlProblem(scene, vp.ControlCost(1.0), [0.0, 0.0], [0.0, 0.0], dt=1e-2, steps=5)
+    other, tell = vp.Scene(vp.planar_chain(3)), opened(scene).progress
     with refused(vp.InputError, "progress"):
-        vp.solve(problem, progress=view.progress)
-    with refused(vp.InputError, "ghost"):
-        vp.LiveView(scene, marks=vp.Marks(ghost=[[0.0, 0.0]]))
+        vp.solve(problem, progress=tell)
     with refused(vp.InputError, "'chain2'", "2", "3"):
-        vp.simulate(vp.Scene(vp.planar_chain(3)), np.zeros(3), np.zeros(3), dt=1e-3, steps=10, progress=view.progress)
-    with refused(vp.InputError, "LiveView", "Robot", "Scene", "OptimalControlProblem"):
-        vp.LiveView(scene.robot.model)
-    with refused(vp.UnknownFrame, "trace", "'chain2'", "'hand'"):
-        vp.LiveView(scene, marks=vp.Marks(trace="hand"))
-    with refused(vp.InputError, "speed", "0.0"):
-        vp.LiveView(scene, speed=0.0)
+        vp.simulate(other, np.zeros(3), np.zeros(3), dt=1e-3, steps=10, progress=tell)
+    for given, options, kind, facts in (
+        (scene, {"marks": vp.Marks(ghost=[[0.0, 0.0]])}, vp.InputError, "ghost"),
+        (scene, {"marks": vp.Marks(trace="hand")}, vp.UnknownFrame, ("trace", "'chain2'", "'hand'")),
+        (scene, {"speed": 0.0}, vp.InputError, ("speed", "0.0")),
+        (scene.robot.model, {}, vp.InputError, ("LiveView", "Robot", "Scene", "OptimalControlProblem")),
+    ):
+        with refused(kind, facts):
+            vp.LiveView(given, **options)
 
 
 def law(t, q, v):
     return np.array([np.sin(t), -q[0]])
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"controls": law, "period": 3},
-        {"controls": vp.OpenLoop(lambda t: [np.sin(t), 0.0]), "integrator": vp.Gauss(2)},
-        {"controls": vp.FirstOrderHold(np.linspace(0.0, 1.0, 802).reshape(401, 2))},
-    ],
-)
-def test_who_asks_for_nodes_gets_all_of_them_once(scene, options, monkeypatch):
+CONTROLS = [
+    None,
+    law,
+    vp.OpenLoop(lambda t: [np.sin(t), 0.0]),
+    vp.FirstOrderHold(np.linspace(0, 1, 802).reshape(401, 2)),
+]
+
+
+@pytest.mark.parametrize("controls", CONTROLS)
+def test_who_asks_for_nodes_gets_all_of_them_once(scene, controls, monkeypatch):
     monkeypatch.setattr("varpin.simulation.simulate._CHUNK", 50)
     parts = []
 
@@ -194,9 +182,9 @@ def test_who_asks_for_nodes_gets_all_of_them_once(scene, options, monkeypatch):
         assert nodes.t[-1] == pytest.approx(done * 1e-3)
         parts.append(nodes)
 
-    start = {"q0": [0.3, 0.0], "v0": [0.0, 0.0], "dt": 1e-3, "steps": 400}
-    told = vp.simulate(scene, **start, **options, progress=progress)
-    plain = vp.simulate(scene, **start, **options)
+    given = {"q0": [0.3, 0.0], "v0": [0.0, 0.0], "dt": 1e-3, "steps": 400, "controls": controls}
+    given |= {"period": 3} if controls is law else {}
+    told, plain = vp.simulate(scene, **given, progress=progress), vp.simulate(scene, **given)
     assert len(parts) > 10
     for name in ("t", "q", "v"):
         rows = np.concatenate([getattr(parts[0], name)[:1], *(getattr(part, name)[1:] for part in parts)])

@@ -34,50 +34,46 @@ def drawn(axes):
     return {line.get_label(): line for line in axes.lines if not line.get_label().startswith("_")}
 
 
+def legend_of(owner):
+    legends = owner.legends if isinstance(owner, Figure) else [owner.get_legend()]
+    return [text.get_text() for legend in legends if legend is not None for text in legend.get_texts()]
+
+
 @pytest.mark.parametrize(("label", "draw"), SINGLE.items())
-def test_single_figures_have_units_and_return_figure_and_axes(label, draw):
-    _, trajectory = swing()
-    figure, axes = draw(trajectory)
+def test_single_figures_have_units_and_lines_under_the_joints_names(label, draw):
+    robot, motion = swing()
+    values = (motion.q, motion.v, np.vstack([motion.u, motion.u[-1:]]), motion.energy[:, None] - motion.energy[0])
+    data = dict(zip(SINGLE, values, strict=True))[label]
+    named = {"robot": robot} if len(data.T) > 1 else {}
+    figure, axes = draw(motion, **named)
     assert axes.figure is figure
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("time [s]", label)
-    assert axes.get_xlim() == (0.0, trajectory.t[-1])
+    assert (axes.get_xlabel(), axes.get_xlim()) == ("time [s]", (0.0, motion.t[-1]))
+    assert axes.get_ylabel() == (label.split(" or ")[0] + "]" if named else label)
+    names = list(motion.joint_names) if named else ["energy"]
+    assert list(drawn(axes)) == names
+    assert legend_of(axes) == (names if named else [])
+    for line, column in zip(drawn(axes).values(), data.T, strict=True):
+        np.testing.assert_array_equal(line.get_xydata(), np.column_stack([motion.t, column]))
     mine = Figure()
     given = mine.subplots()
-    assert draw(trajectory, axes=given) == (mine, given)
+    assert draw(motion, axes=given) == (mine, given)
+    assert given.get_ylabel() == label
     assert given.lines
 
 
-def test_lines_hold_the_data_under_the_joints_names():
-    robot, trajectory = swing()
-    for draw, values, unit in (
-        (plots.plot_joints, trajectory.q, "position [rad]"),
-        (plots.plot_velocities, trajectory.v, "velocity [rad/s]"),
-    ):
-        _, axes = draw(trajectory, robot=robot)
-        lines = drawn(axes)
-        assert tuple(lines) == trajectory.joint_names
-        assert [text.get_text() for text in axes.get_legend().get_texts()] == list(trajectory.joint_names)
-        assert axes.get_ylabel() == unit
-        for line, column in zip(lines.values(), values.T, strict=True):
-            np.testing.assert_array_equal(line.get_ydata(), column)
-            np.testing.assert_array_equal(line.get_xdata(), trajectory.t)
-
-
 def test_prismatic_joints_are_in_metres_and_mixed_ones_say_which():
-    robot = vp.load_robot("panda")
-    trajectory = vp.simulate(vp.Scene(robot, gravity=False), np.zeros(8), np.full(8, 0.01), dt=1e-3, steps=5)
-    _, axes = plots.plot_joints(trajectory, robot=robot)
-    assert axes.get_ylabel() == "position [rad, m]"
-    names = list(drawn(axes))
-    assert (names[0], names[-1]) == ("panda_joint1 [rad]", "panda_finger_joint1 [m]")
-    _, axes = plots.plot_controls(trajectory, robot=robot)
-    assert axes.get_ylabel() == "control [N m, N]"
-
-    fingers = vp.load_robot("panda", lock={f"panda_joint{k}": 0.0 for k in range(1, 8)})
-    slide = vp.simulate(vp.Scene(fingers), [0.0], [0.1], dt=1e-3, steps=5)
-    assert plots.plot_joints(slide, robot=fingers)[1].get_ylabel() == "position [m]"
-    assert plots.plot_velocities(slide, robot=fingers)[1].get_ylabel() == "velocity [m/s]"
-    assert plots.plot_controls(slide, robot=fingers)[1].get_ylabel() == "control [N]"
+    fingers = {"lock": {f"panda_joint{k}": 0.0 for k in range(1, 8)}}
+    for options, units in (({}, ("rad, m", "rad/s, m/s", "N m, N")), (fingers, ("m", "m/s", "N"))):
+        robot = vp.load_robot("panda", **options)
+        n = robot.dof
+        motion = vp.simulate(vp.Scene(robot, gravity=False), np.zeros(n), np.full(n, 0.01), dt=1e-3, steps=5)
+        for draw, kind, unit in zip([*SINGLE.values()][:3], ("position", "velocity", "control"), units, strict=True):
+            _, axes = draw(motion, robot=robot)
+            assert axes.get_ylabel() == f"{kind} [{unit}]"
+            names = list(drawn(axes))
+            mixed = unit.split(", ")
+            if len(mixed) > 1:
+                assert (names[0], names[-1]) == (f"panda_joint1 [{mixed[0]}]", f"panda_finger_joint1 [{mixed[1]}]")
 
 
 def test_controls_are_steps_held_to_the_end_of_the_last_interval():
@@ -108,57 +104,36 @@ def test_controls_of_a_motion_whose_file_has_ties_of_another_shape(shape):
     assert plots.plot_controls(odd)[1].get_ylabel() == "control [N m or N]"
 
 
-BY_HAND = {"constraints": vp.KinematicInput("joint1"), "actuation": ["joint1"]}
-CUBIC = vp.KinematicInput("joint1", "cubic")
+BY_HAND, CUBIC = vp.KinematicInput("joint1"), vp.KinematicInput("joint1", "cubic")
+SERVO = vp.PositionServo({"joint2": 50.0}, 1.0)
+AT, TORQUE = "commanded position [rad]", "control [N m]"
 
 
 @pytest.mark.parametrize(
     ("links", "options", "label", "names"),
     [
-        (3, {"actuation": ["joint1", "joint3"]}, "control [N m]", ["joint1", "joint3"]),
+        (3, {"actuation": ["joint1", "joint3"]}, TORQUE, ["joint1", "joint3"]),
         (3, {"actuation": np.ones((3, 2))}, "control [N m or N]", ["u1", "u2"]),
-        (2, BY_HAND, "commanded position [rad]", ["joint1"]),
-        (1, {"constraints": vp.KinematicInput("joint1")}, "commanded position [rad]", ["joint1"]),
+        (2, {"constraints": BY_HAND, "actuation": ["joint1"]}, AT, ["joint1"]),
+        (1, {"constraints": BY_HAND}, AT, ["joint1"]),
+        (2, {"forces": vp.PositionServo(50.0, 1.0)}, AT, ["joint1", "joint2"]),
+        (2, {"forces": SERVO, "actuation": ["joint2"]}, AT, ["joint2"]),
+        (2, {"constraints": BY_HAND}, "control [rad, N m]", [f"joint1, {AT}", f"joint2, {TORQUE}"]),
+        (2, {"forces": SERVO}, "control [N m, rad]", [f"joint1, {TORQUE}", f"joint2, {AT}"]),
         # As many controls as joints, and none of them a torque.
         (
             2,
-            BY_HAND | {"constraints": CUBIC},
+            {"constraints": CUBIC, "actuation": ["joint1"]},
             "control [rad, rad/s]",
-            ["joint1, commanded position [rad]", "joint1, velocity [rad/s]"],
-        ),
-        (
-            2,
-            {"constraints": vp.KinematicInput("joint1")},
-            "control [rad, N m]",
-            ["joint1, commanded position [rad]", "joint2, control [N m]"],
-        ),
-        (2, {"forces": vp.PositionServo(50.0, 1.0)}, "commanded position [rad]", ["joint1", "joint2"]),
-        (
-            2,
-            {"forces": vp.PositionServo({"joint2": 50.0}, 1.0)},
-            "control [N m, rad]",
-            ["joint1, control [N m]", "joint2, commanded position [rad]"],
-        ),
-        (
-            2,
-            {"forces": vp.PositionServo({"joint2": 50.0}, 1.0), "actuation": ["joint2"]},
-            "commanded position [rad]",
-            ["joint2"],
+            [f"joint1, {AT}", "joint1, velocity [rad/s]"],
         ),
     ],
 )
 def test_controls_have_the_names_of_the_joints_that_they_move(links, options, label, names):
-    """Those of servos and joints moved by hand are positions and velocities."""
     scene = vp.Scene(vp.planar_chain(links), **options)
     motion = vp.simulate(scene, np.full(links, 0.3), np.zeros(links), dt=0.02, steps=3, check=False)
     _, axes = plots.plot_controls(motion, robot=scene.robot)
     assert (axes.get_ylabel(), list(drawn(axes))) == (label, names)
-
-
-def test_energy_error_is_the_change_of_the_energy():
-    _, trajectory = swing()
-    _, axes = plots.plot_energy_error(trajectory)
-    np.testing.assert_array_equal(drawn(axes)["energy"].get_ydata(), trajectory.energy - trajectory.energy[0])
 
 
 @pytest.mark.parametrize("links", [1, 3, 19])
@@ -166,16 +141,11 @@ def test_overview_has_everything_once(links):
     robot, trajectory = swing(links=links, controls=np.full((40, links), 0.1))
     figure, axes = plots.plot_trajectory(trajectory, robot=robot)
     assert isinstance(figure, Figure)
-    assert [panel.get_ylabel() for panel in axes] == [
-        "position [rad]",
-        "velocity [rad/s]",
-        "control [N m]",
-        "E(t) - E(0) [J]",
-    ]
+    labels = [panel.get_ylabel() for panel in axes]
+    assert labels == ["position [rad]", "velocity [rad/s]", "control [N m]", "E(t) - E(0) [J]"]
     assert [panel.get_xlabel() for panel in axes] == ["", "", "", "time [s]"]
-    assert [panel.get_legend() for panel in axes] == [None] * 4
-    names = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-    assert names == (list(trajectory.joint_names) if links > 1 else [])
+    assert [legend_of(panel) for panel in axes] == [[]] * 4
+    assert legend_of(figure) == (list(trajectory.joint_names) if links > 1 else [])
     styles = {(line.get_color(), line.get_linestyle()) for line in drawn(axes[0]).values()}
     assert len(styles) == links
     figure.canvas.draw()
@@ -187,38 +157,29 @@ def test_overview_has_everything_once(links):
 
 def test_what_is_no_motion_record_robot_or_axes_is_refused():
     robot, trajectory = swing(links=2, steps=3, controls=[0.1, 0.2])
-    of_motions = [plots.plot_trajectory, *SINGLE.values()]
-    for value in (None, 3, "motion.npz", robot):
-        for draw in of_motions:
+    for draw in (plots.plot_trajectory, *SINGLE.values()):
+        for value in (None, "motion.npz", robot):
             with refused(vp.InputError, "Trajectory", type(value).__name__):
                 draw(value)
-        with refused(vp.InputError, "varpin.work_precision", type(value).__name__):
-            plots.plot_study(value)
-        with refused(vp.InputError, "axes", "matplotlib.figure.Figure"):
-            plots.apply_style(value)
     for draw in SINGLE.values():
         with refused(vp.InputError, "axes", "matplotlib.figure.Figure", "'x'"):
             draw(trajectory, "x")
     for draw in (plots.plot_trajectory, plots.plot_joints, plots.plot_velocities, plots.plot_controls):
         with refused(vp.InputError, "robot", "load_robot", "str"):
             draw(trajectory, robot="ur5")
+    with refused(vp.InputError, "varpin.work_precision", "Robot"):
+        plots.plot_study(robot)
+    with refused(vp.InputError, "axes", "matplotlib.figure.Figure"):
+        plots.apply_style(3)
     with refused(vp.InputError, "joint1, joint2, joint3"):
         plots.plot_joints(trajectory, robot=vp.planar_chain(3))
 
 
 def test_plans_and_runs_are_drawn_as_their_motions():
     """And the limits of the controls are those of the plan, not the robot's."""
-    robot = vp.planar_chain(2)
-    cost = vp.TrackingCost([0.4, 0.2], 1.0) + vp.ControlCost(1e-3)
-    problem = vp.OptimalControlProblem(
-        vp.Scene(robot, gravity=False),
-        cost,
-        np.zeros(2),
-        np.zeros(2),
-        dt=0.02,
-        steps=8,
-        control_limits=([-1, -2], [1, 2]),
-    )
+    cost, limits = vp.TrackingCost([0.4, 0.2], 1.0) + vp.ControlCost(1e-3), ([-1, -2], [1, 2])
+    scene = vp.Scene(vp.planar_chain(2), gravity=False)
+    problem = vp.OptimalControlProblem(scene, cost, [0, 0], [0, 0], dt=0.02, steps=8, control_limits=limits)
     plan, run = vp.solve(problem), vp.Mpc(problem).run(duration=0.04)
     for given, motion in ((plan, plan.trajectory), (run, run.motion)):
         for draw in (*SINGLE.values(), plots.plot_trajectory):
@@ -226,10 +187,9 @@ def test_plans_and_runs_are_drawn_as_their_motions():
             for mine, other in zip(*panels, strict=True):
                 for line, same in zip(drawn(mine).values(), drawn(other).values(), strict=True):
                     np.testing.assert_array_equal(line.get_xydata(), same.get_xydata())
-        _, axes = plots.plot_controls(given, robot=robot)
+        _, axes = plots.plot_controls(given, robot=scene.robot)
         places = {path.vertices[0, 1] for lines in axes.collections for path in lines.get_paths()}
-        assert places <= {-1.0, 1.0, -2.0, 2.0}
-        assert places
+        assert {-1.0, 1.0, -2.0, 2.0} >= places > set()
     with refused(vp.InputError, "Trajectory", "OptimalControlProblem"):
         plots.plot_joints(problem)
 
@@ -264,11 +224,6 @@ def test_limits_are_drawn_where_the_motion_comes_near_them():
     assert limit_lines(turned, None) == []
 
 
-def legend_of(owner):
-    legends = owner.legends if isinstance(owner, Figure) else [owner.get_legend()]
-    return [text.get_text() for legend in legends if legend is not None for text in legend.get_texts()]
-
-
 def test_limits_have_an_entry_in_every_legend():
     """In one panel, also of one joint, and once in an overview whose velocities alone come near their limits."""
     robot, motion = swing(links=1)
@@ -289,7 +244,6 @@ def limit_lines(trajectory, robot):
 
 
 def test_plotting_a_motion_imports_no_optimizer():
-    """Only figures of studies have to know studies."""
     found = "any(name.startswith(('varpin.control', 'varpin.study')) for name in sys.modules)"
     program = f"import sys, varpin.show.plots; sys.exit({found})"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

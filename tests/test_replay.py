@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from chromium import animation, commands, picture, seek, severe, shape_poses, shapes_stand, visit, wait_until
+from chromium import animation, commands, connect, picture, seek, severe, shape_poses, shapes_stand, visit, wait_until
 from mechanisms import joint, link, write_urdf
 from refusals import naming, refused
 from selenium.webdriver.common.by import By
@@ -30,10 +30,8 @@ def motion(finger):
     return vp.simulate(scene, q0=[0.9, 1.2, 0.8], v0=[0.0, 0.0, 0.0], dt=1e-3, steps=500)
 
 
-def test_page_plays_offline_and_shows_the_finger_large(browser, finger, motion, tmp_path):
-    page = replay(finger, motion, html=tmp_path / "finger.html")
-    assert ">loading<" in page.read_text()
-    visit(browser, page)
+def test_page_plays_offline_and_shows_the_finger_large(show, browser, finger, motion):
+    assert ">loading<" in show(finger, motion).read_text()
     assert browser.execute_script("return viewer.animator.playing")
     assert browser.find_elements(By.ID, "loading") == []
 
@@ -43,13 +41,9 @@ def test_page_plays_offline_and_shows_the_finger_large(browser, finger, motion, 
     skin = (first[..., 0] > first[..., 2] + 30.0).mean()
     assert 0.04 < skin < 0.6
     seek(browser, 0.5)
-    last = picture(browser)
-    changed = (np.abs(last - first).max(axis=-1) > 40.0).mean()
-    noise = (np.abs(again - first).max(axis=-1) > 40.0).mean()
+    noise, changed = ((np.abs(other - first).max(axis=-1) > 40.0).mean() for other in (again, picture(browser)))
     assert noise < 1e-4
     assert changed > 0.01
-
-    assert severe(browser) == []
     fetched = browser.execute_script("return performance.getEntriesByType('resource').map(entry => entry.name)")
     assert [url for url in fetched if not url.startswith(("data:", "blob:"))] == []
 
@@ -57,21 +51,39 @@ def test_page_plays_offline_and_shows_the_finger_large(browser, finger, motion, 
 @pytest.mark.parametrize(
     "name", ["finger", "ur5", *(pytest.param(name, marks=pytest.mark.slow) for name in ("kinova", "panda"))]
 )
-def test_page_poses_every_shape_as_pinocchio_does(browser, tmp_path, name):
+def test_page_poses_every_shape_as_pinocchio_does(show, browser, name):
+    """Those of the robot, and of its ghost, whose three rows stand at 0, 0.75 and 1.5 s."""
     robot = vp.load_robot(name)
     rng = np.random.default_rng(5)
     q = rng.uniform(-1.0, 1.0, (4, robot.dof)) * np.where(robot.unbounded, 8.0, 1.0)
-    visit(browser, replay(robot, q, dt=0.5, html=tmp_path / "poses.html"))
-    for seconds, expected in [(0.0, q[0]), (0.75, 0.5 * (q[1] + q[2])), (1.5, q[3])]:
+    ghost = rng.uniform(-1.0, 1.0, (3, robot.dof))
+    show(robot, q, dt=0.5, marks=vp.Marks(ghost=ghost))
+    for seconds, now, then in [
+        (0.0, q[0], ghost[0]),
+        (0.75, 0.5 * (q[1] + q[2]), ghost[1]),
+        (1.125, 0.75 * q[2] + 0.25 * q[3], 0.5 * (ghost[1] + ghost[2])),
+        (1.5, q[3], ghost[2]),
+    ]:
         seek(browser, seconds)
-        assert shapes_stand(browser, robot, expected)
+        assert shapes_stand(browser, robot, now)
+        assert shapes_stand(browser, robot, then, "ghost")
+    looks = browser.execute_script(
+        """
+        const looks = [];
+        viewer.scene_tree.find(["meshcat", "ghost"]).object.traverse(node => {
+            if (node.isMesh && node.parent.parent.name == "shapes")
+                looks.push([node.material.transparent, node.material.opacity]);
+        });
+        return looks;"""
+    )
+    assert looks
+    assert all(transparent and 0.1 < opacity < 0.6 for transparent, opacity in looks)
 
 
 @pytest.mark.parametrize(("dt", "steps", "speed"), [(1e-4, 3000, 1.0), (1e-4, 7, 1.0), (2e-2, 40, 0.1), (0.7, 3, 1.0)])
-def test_duration_is_the_motions(browser, finger, tmp_path, dt, steps, speed):
+def test_duration_is_the_motions(show, browser, finger, dt, steps, speed):
     q, duration = np.linspace([0.0, 0.0, 0.0], [1.0, 0.5, 0.2], steps + 1), steps * dt / speed
-    path = replay(finger, q, dt=dt, speed=speed, html=tmp_path / "speed.html")
-    visit(browser, path)
+    path = show(finger, q, dt=dt, speed=speed)
     assert browser.execute_script("return viewer.animator.duration") == pytest.approx(duration, rel=1e-6)
     tracks, options = animation(path)
     assert options == {"play": True, "repetitions": float("inf")}
@@ -92,9 +104,8 @@ def bar(browser):
     )
 
 
-def test_the_bar_plays_pauses_and_goes_to_a_time(browser, finger, tmp_path):
-    q = np.linspace([0.1, 0.2, 0.3], [0.9, 0.8, 0.7], 21)
-    visit(browser, replay(finger, q, dt=0.1, speed=0.5, html=tmp_path / "bar.html"))
+def test_the_bar_plays_pauses_and_goes_to_a_time(show, browser, finger):
+    show(finger, np.linspace([0.1, 0.2, 0.3], [0.9, 0.8, 0.7], 21), dt=0.1, speed=0.5)
     assert bar(browser)[1:] == [2.0, True]
     browser.find_element(By.ID, "play").click()
     paused = bar(browser)
@@ -161,30 +172,6 @@ def test_size_stays_sane_for_a_long_motion(finger, tmp_path):
         np.testing.assert_allclose(np.interp(t, times, values), column, atol=3e-3)
 
 
-@pytest.mark.parametrize("name", ["finger", pytest.param("ur5", marks=pytest.mark.slow)])
-def test_ghost_follows_its_own_motion(browser, tmp_path, name):
-    robot = vp.load_robot(name)
-    rng = np.random.default_rng(7)
-    q, ghost = rng.uniform(-1.0, 1.0, (4, robot.dof)), rng.uniform(-1.0, 1.0, (3, robot.dof))
-    visit(browser, replay(robot, q, dt=0.5, marks=vp.Marks(ghost=ghost), html=tmp_path / "ghost.html"))
-    # Its three rows stand at 0, 0.75 and 1.5 s.
-    for seconds, expected in [(0.0, ghost[0]), (0.375, 0.5 * (ghost[0] + ghost[1])), (0.75, ghost[1]), (1.5, ghost[2])]:
-        seek(browser, seconds)
-        assert shapes_stand(browser, robot, expected, "ghost")
-    looks = browser.execute_script(
-        """
-        const looks = [];
-        viewer.scene_tree.find(["meshcat", "ghost"]).object.traverse(node => {
-            if (node.isMesh && node.parent.parent.name == "shapes")
-                looks.push([node.material.transparent, node.material.opacity]);
-        });
-        return looks;"""
-    )
-    assert looks
-    assert all(transparent and 0.1 < opacity < 0.6 for transparent, opacity in looks)
-    assert severe(browser) == []
-
-
 def test_ghost_keeps_its_corners_between_sparse_nodes_of_the_motion(finger, tmp_path):
     ghost = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     path = replay(
@@ -197,19 +184,16 @@ def test_ghost_keeps_its_corners_between_sparse_nodes_of_the_motion(finger, tmp_
         np.testing.assert_allclose(values, [0.0, 1.0, 0.5, 0.0, 1.0] if moves else np.zeros(5), atol=1e-6)
 
 
-def test_a_model_without_geometry_gets_a_skeleton(browser, tmp_path, caplog):
-    chain = vp.planar_chain(3)
+def test_a_model_without_geometry_gets_a_skeleton(show, browser, caplog):
     with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
-        path = replay(chain, np.zeros((2, 3)), dt=1.0, html=tmp_path / "chain.html")
+        show(vp.planar_chain(3), np.zeros((2, 3)), dt=1.0)
     assert naming(caplog.messages, "'chain3'", "skeleton")
-    visit(browser, path)
     poses = shape_poses(browser)
     for place in np.arange(0.0, 3.0, 0.5):
         assert any(np.allclose(pose[:3, 3], [place, 0.0, 0.0], atol=1e-6) for pose in poses.values())
 
 
 def test_a_missing_mesh_costs_its_link_alone(tmp_path, caplog):
-    """Of a box, an unreadable rod and a ball, the rod alone is drawn as a skeleton."""
     shapes = {
         "box": '<box size="1 1 1"/>',
         "rod": '<mesh filename="no_such_mesh.stl"/>',
@@ -240,6 +224,11 @@ def test_a_mesh_the_page_cannot_take_is_left_out(browser, tmp_path, monkeypatch)
     assert browser.execute_script("return viewer.animator.playing && viewer.animator.duration") == 1.0
 
 
+def end(viewer):
+    viewer.window.server_proc.kill()
+    viewer.window.server_proc.wait()
+
+
 def test_live_window(browser, finger, motion, monkeypatch, capfd):
     opened = []
     monkeypatch.setattr(page_module.webbrowser, "open", lambda url, new=0: opened.append(url) or True)
@@ -247,16 +236,14 @@ def test_live_window(browser, finger, motion, monkeypatch, capfd):
     try:
         assert opened == [viewer.url()]
         assert capfd.readouterr().out == ""
-        online = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
-        browser.execute_cdp_cmd("Network.emulateNetworkConditions", online)
+        connect(browser, online=True)
         browser.get(viewer.url())
         wait_until(lambda: browser.execute_script("return viewer.animator.duration") == 0.5)
         seek(browser, 0.5)
         assert shapes_stand(browser, finger, motion.q[0], "ghost")
     finally:
         browser.get("about:blank")
-        viewer.window.server_proc.kill()
-        viewer.window.server_proc.wait()
+        end(viewer)
 
 
 def test_a_notebook_shows_the_page_in_a_frame(browser, finger, motion, tmp_path):
@@ -278,8 +265,7 @@ def test_a_notebook_shows_the_page_in_a_frame(browser, finger, motion, tmp_path)
 def test_says_where_to_look_when_no_browser_opens(finger, motion, monkeypatch, caplog):
     monkeypatch.setattr(page_module.webbrowser, "open", lambda url, new=0: False)
     viewer = replay(finger, motion, open=True)
-    viewer.window.server_proc.kill()
-    viewer.window.server_proc.wait()
+    end(viewer)
     assert naming(caplog.messages, "browser", viewer.url())
 
 
@@ -297,15 +283,15 @@ def test_refuses_what_it_cannot_show(finger, motion, tmp_path):
     no("0.001 s", dt=0.1)
     no("dt", "0.0", motion=q, dt=0.0)
     no("motion", "(N + 1, 3)", "(3, 2)", motion=np.zeros((3, 2)), dt=0.1)
-    no("motion", "(N + 1, 3)", "(3,)", motion=np.zeros(3), dt=0.1)
     no("motion", "(N + 1, 3)", "(0, 3)", motion=np.zeros((0, 3)), dt=0.1)
     no("motion", "'still'", motion="still", dt=0.1)
     q[1, 2] = np.nan
     no("motion[1, 2]", "nan", motion=q, dt=0.1)
     no("speed", "0", speed=0)
+    for size in ((-1, 3), (700,), 700, ("a", "b")):
+        no("size", html=None, size=size)
     no("fps", "-1", fps=-1)
     no("ghost", "(K, 3)", "(3, 2)", marks=vp.Marks(ghost=np.zeros((3, 2))))
-    no("ghost", "(K, 3)", "(3,)", marks=vp.Marks(ghost=np.zeros(3)))
     no("ghost[1, 2]", "nan", marks=vp.Marks(ghost=q))
     no("ghost", "'still'", marks=vp.Marks(ghost="still"))
     no("ghost", "4", motion=[[0.0, 0.0, 0.0]], dt=1.0, marks=vp.Marks(ghost=motion.q[:4]))
@@ -328,13 +314,13 @@ def test_refuses_an_unwritable_path_before_the_work(finger, motion, tmp_path, mo
 
 
 @pytest.mark.parametrize("size", [(800, 640), (400, 700)])
-def test_all_of_the_motion_is_in_view_above_the_bar(browser, tmp_path, size):
+def test_all_of_the_motion_is_in_view_above_the_bar(show, browser, size):
     robot = vp.load_robot("talos_arm")
     q = np.linspace(-0.5, 0.5, 5)[:, None] * np.ones(robot.dof)
     marks = vp.Marks(targets={"a place with a long name": [0.3, 0.5, 0.6]}, frames=True)
     browser.set_window_size(*size)
     try:
-        visit(browser, replay(robot, q, dt=0.2, html=tmp_path / "view.html", marks=marks))
+        show(robot, q, dt=0.2, marks=marks)
         for seconds in (0.0, 0.4, 0.8):
             seek(browser, seconds)
             canvas, pane, low, high = browser.execute_script(

@@ -1,13 +1,10 @@
 """What a replay's shapes look like: colours of mesh files, textures, and a node of its own for each."""
 
-from __future__ import annotations
-
-import io
 import logging
 
 import numpy as np
 import pytest
-from chromium import commands, visit, wait_until
+from chromium import commands, wait_until
 from mechanisms import joint, link, write_urdf
 from PIL import Image
 from refusals import naming
@@ -54,11 +51,8 @@ def visual(shape, material="", where=0):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A cube in three materials, one of which has a texture."""
     squares = np.kron(np.indices((4, 4)).sum(axis=0) % 2, np.ones((4, 4)))[..., None] * np.array([0, 200, 0])
-    stream = io.BytesIO()
-    Image.fromarray(squares.astype(np.uint8)).save(stream, "png")
-    (tmp_path / "squares.png").write_bytes(stream.getvalue())
+    Image.fromarray(squares.astype(np.uint8)).save(tmp_path / "squares.png")
     (tmp_path / "cube.obj").write_text(CUBE)
     (tmp_path / "cube.mtl").write_text(LIBRARY)
     return tmp_path
@@ -68,7 +62,7 @@ def robot_with(folder, *visuals):
     return vp.load_robot(write_urdf(folder, link("l1", extra="".join(visuals)), joint("j1", "base", "l1")))
 
 
-def test_shapes_have_the_colours_of_their_files(browser, folder):
+def test_shapes_have_the_colours_of_their_files(show, browser, folder):
     colored = "\n".join(f"{line} {line[2]} {line[4]} {line[6]}" for line in CORNERS)
     (folder / "rainbow.obj").write_text(colored + "\nf 1 2 4 3\nf 5 7 8 6\n")
     robot = robot_with(
@@ -81,7 +75,7 @@ def test_shapes_have_the_colours_of_their_files(browser, folder):
         visual('<mesh filename="package://rainbow.obj"/>', "", 10),
         visual('<box size="1 1 1"/>', BLACK, 12),
     )
-    visit(browser, vp.replay(robot, np.zeros((1, 1)), dt=1.0, html=folder / "a.html"))
+    show(robot, np.zeros((1, 1)), dt=1.0)
     wait_until(lambda: sum(look[1] == 16 for look in browser.execute_script(LOOKS).values()) == 5)
     found = {name.replace("l1_", ""): look for name, look in browser.execute_script(LOOKS).items()}
     cube = [["#e61a1a", 0, 1, False], ["#1a1ae6", 0, 0.5, False], ["#ffffff", 16, 1, False]]

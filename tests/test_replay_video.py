@@ -1,7 +1,6 @@
 """Films of replays, taken by a real browser."""
 
 import importlib.util
-import itertools
 import shutil
 
 import imageio.v3 as imageio
@@ -29,25 +28,16 @@ def frames(path):
     )
 
 
-@pytest.mark.slow
-def test_a_gif_has_a_frame_for_each_moment_and_they_differ(browser, chain, tmp_path):
-    path = tmp_path / "chain.gif"
-    size = (320, 240)
-    assert replay(chain, Q, dt=0.1, video=path, fps=10.0, size=size) == path
+def test_frames_are_at_exact_times(browser, chain, tmp_path):
+    q = np.repeat([[0.0, 0.0], [1.0, 0.5]], [6, 5], axis=0)  # moves between 0.5 s and 0.6 s alone
+    path = tmp_path / "jump.gif"
+    assert replay(chain, q, dt=0.1, video=path, fps=10.0, size=(320, 240)) == path
     film = frames(path)
     assert film.shape == (11, 240, 320, 3)
     assert Image.open(path).info["duration"] == 100  # [ms]
-    for before, after in itertools.pairwise(film):
-        assert (np.abs(after - before).max(axis=-1) > 40.0).mean() > 1e-3
-
-
-def test_frames_are_at_exact_times(browser, chain, tmp_path):
-    q = np.repeat([[0.0, 0.0], [1.0, 0.5]], [6, 5], axis=0)  # moves between 0.5 s and 0.6 s alone
-    film = frames(replay(chain, q, dt=0.1, video=tmp_path / "jump.gif", fps=10.0, size=(320, 240)))
-    assert len(film) == 11
     assert (film[:6] == film[0]).all()
     assert (film[6:] == film[-1]).all()
-    assert (film[0] != film[-1]).any()
+    assert (np.abs(film[6] - film[5]).max(axis=-1) > 40.0).mean() > 1e-3
 
 
 def test_an_mp4_and_its_page(browser, chain, tmp_path):
@@ -79,7 +69,6 @@ def test_says_what_is_missing_and_how_to_get_it(chain, tmp_path, monkeypatch):
 
     error = without("imageio", "imageio_ffmpeg")
     assert (error.missing, error.command) == (("imageio", "imageio-ffmpeg"), 'pip install "varpin[video]"')
-    assert error.missing == ("imageio", "imageio-ffmpeg")
     assert isinstance(error, ImportError)
     assert without("selenium").missing == ("selenium",)
     nothing = without("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chromedriver")

@@ -17,16 +17,9 @@ from varpin.model.chain import rod_chain
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A closed loop, a state near it, and what drives it.
+    """A closed loop, a guess that it is assembled from, and a velocity of which the part along the constraints counts.
 
-    Attributes:
-        name: Unique.
-        scene: With its constraints and forces.
-        start: Where the assembly begins (n,) [rad or m].
-        push: A velocity, one number or (n,), of which the part along the constraints counts [rad/s or m/s].
-        controls: A function of time, or None.
-        duration: [s].
-        stiff: Whether the oracle is to be implicit.
+    Controls are a function of time, or None; ``stiff`` is whether the oracle is to be implicit.
     """
 
     name: str
