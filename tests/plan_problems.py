@@ -14,6 +14,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import pinocchio as pin
+from mechanisms import random_axis, random_inertia
 from oracles import placements
 
 import varpin as vp
@@ -81,13 +83,68 @@ def tracking(t: object) -> np.ndarray:
     return 0.3 * np.sin(4.0 * np.asarray(t)[..., None] + np.arange(3))
 
 
-def wave(*constraints: vp.PlanConstraint, **options: object) -> vp.OptimalControlProblem:
+def wave(*constraints: vp.PlanConstraint, scene: vp.Scene | None = None, **options: object) -> vp.OptimalControlProblem:
     """Three links that follow a wave."""
-    cost = vp.TrackingCost(tracking, 50.0) + vp.ControlCost(1e-3)
+    cost, given = vp.TrackingCost(tracking, 50.0) + vp.ControlCost(1e-3), {"dt": 0.08, "steps": 10, **options}
+    scene = scene or vp.Scene(THREE, damping=0.2)
+    return vp.OptimalControlProblem(scene, cost, tracking(0.0), np.zeros(3), constraints=constraints, **given)
+
+
+def swing(
+    *constraints: vp.PlanConstraint, scene: vp.Scene | None = None, **options: object
+) -> vp.OptimalControlProblem:
+    """Two links that are to follow a wave faster than their limits allow."""
+    cost = vp.TrackingCost(lambda t: [0.5 * np.sin(3.0 * t), 0.3 * np.sin(4.0 * t)], 100.0)
+    cost += vp.ControlCost(1e-4) + vp.VelocityCost(1e-2)
+    given = {"dt": 0.03, "steps": 15, "constraints": constraints, **options}
+    return vp.OptimalControlProblem(scene or vp.Scene(TWO, damping=0.3), cost, REST, REST, **given)
+
+
+def sliders(count: int) -> vp.Robot:
+    """A chain of oblique prismatic joints: its mass matrix is constant, and full."""
+    rng, model = np.random.default_rng(0), pin.Model()
+    for k in range(count):
+        joint = pin.JointModelPrismaticUnaligned(random_axis(rng))
+        new = model.addJoint(k, joint, pin.SE3.Identity(), f"joint{k}")
+        model.appendBodyToJoint(new, random_inertia(rng), pin.SE3.Identity())
+    return vp.load_robot(model)
+
+
+def small(cost: vp.Cost | None = None, *, actuation: object = None, **options: object) -> vp.OptimalControlProblem:
+    """Two sliders to (1, 0) in a second."""
+    goal = vp.TrackingCost([1.0, 0.0])
+    cost = goal + vp.ControlCost(0.1) + vp.Terminal(goal) if cost is None else cost
+    scene, given = vp.Scene(sliders(2), gravity=False, actuation=actuation), {"dt": 0.05, "steps": 20, **options}
+    return vp.OptimalControlProblem(scene, cost, [0.3, 0.1], [0, 0], **given)
+
+
+def linear(
+    more: vp.Cost | None = None, *, noise: vp.Noise | None = None, q0: Sequence[float] = (0.3, -0.4), **options: object
+) -> vp.OptimalControlProblem:
+    """Two sliders with springs, which follow a wave and end at rest: a linear system under squares."""
+    given = {"damping": [0.3, 0.1], "stiffness": [1.0, 0.0], "rest": [0.1, -0.2], "noise": noise}
+    scene = vp.Scene(sliders(2), gravity=False, actuation=((1.0, 0.4), (-0.2, 1.3)), **given)
+    cost = vp.TrackingCost(lambda t: [np.sin(3 * t), 0.2], [[2.0, 0.3], [0.3, 1.0]])
+    cost += vp.ControlCost([0.05, 0.02], reference=[0.3, -0.1])
+    cost += vp.Terminal(vp.TrackingCost([1.0, 0.5], 3.0) + vp.VelocityCost(0.7))
     return vp.OptimalControlProblem(
-        vp.Scene(THREE, damping=0.2), cost, tracking(0.0), np.zeros(3), dt=0.08, steps=10,
-        constraints=constraints, **options,
+        scene, cost if more is None else cost + more, q0, [0.5, 0.1], **{"dt": 0.05, "steps": 24, **options}
+    )
+
+
+def hand(interpolation: str, **options: object) -> vp.OptimalControlProblem:
+    """A joint moved by hand, and motors on the next ones, all linear between nodes."""
+    cubic = [1e-2] if interpolation == "cubic" else []
+    moved = vp.KinematicInput("joint1", interpolation)
+    robot = vp.planar_chain(3, length=0.5)
+    scene = vp.Scene(
+        robot, gravity=False, damping=0.2, actuation=robot.joint_names, constraints=moved,
+        noise=options.pop("noise", None),
     )  # fmt: skip
+    cost = vp.ControlRateCost([0.3, 0.0, 0.0, *cubic]) + vp.ControlCost([0.1, 1e-2, 2e-2, *cubic])
+    cost += vp.Terminal(vp.TrackingCost([0.4, -0.6, 0.2], 50.0) + vp.VelocityCost([0.0, 5.0, 5.0]))
+    given = {"dt": 0.08, "steps": 6, "integrator": vp.Gauss(2), "controls": "linear"} | options
+    return vp.OptimalControlProblem(scene, cost, [0.1, 0.2, 0.3], np.zeros(3), **given)
 
 
 def served() -> vp.OptimalControlProblem:
@@ -110,6 +167,7 @@ def loop() -> vp.OptimalControlProblem:
     return vp.OptimalControlProblem(scene, cost, begin, np.zeros(3), dt=0.06, steps=12, constraints=[within])
 
 
+HAND_SPEEDS = vp.WithinVelocityLimits(vp.planar_chain(3, length=0.5), (-1.7, 1.7))
 LIMITS = {"control_limits": ([-20.0, -6.0], [20.0, 6.0])}
 BALL = vp.Obstacle.sphere([1.5, 0.0, -1.25], 0.15)
 LINE = np.linspace(0.0, 1.0, 13)[:, None] * np.array([1.0, 0.5])
@@ -151,6 +209,12 @@ SMALL: dict[str, Case] = {
     "held, sphere between nodes": Case(
         lambda: reach(vp.KeepOutOfSphere(TWO, "tip", [1.3, 0.0, -1.3], 0.3), between_nodes=True, dt=0.09, steps=8),
         31.882135,
+        kkt=None,
+        within=1e-4,
+    ),
+    "held, clear of a ball between nodes": Case(
+        lambda: reach(vp.KeepClear(TWO, [BALL], 0.05, capsules=CAPSULES), between_nodes=True, dt=0.09, steps=8),
+        40.01867,
         kkt=None,
         within=1e-4,
     ),
@@ -196,8 +260,28 @@ SMALL: dict[str, Case] = {
     "midpoint rule": Case(
         lambda: reach(speeds(1.8), integrator=vp.SemiImplicitEuler(), sampling="midpoint"), 3.5644662
     ),
+    "midpoint rule over 2 steps": Case(
+        lambda: reach(integrator=vp.Midpoint(alpha=0.4), sampling="midpoint", dt=0.03, steps=24, hold=2), 2.1356254
+    ),
+    "start rule over 2 steps": Case(
+        lambda: reach(integrator=vp.ExplicitEuler(), sampling="start", dt=0.03, steps=24, hold=2), 2.1258443
+    ),
+    "an input, linear": Case(lambda: hand("linear"), 0.11032363),
+    "an input, cubic": Case(lambda: hand("cubic"), 0.084316886, options={"second_order": True}),
+    "an input, speeds between nodes": Case(
+        lambda: hand("linear", constraints=[HAND_SPEEDS], between_nodes=True), 0.30936308, kkt=None, within=3.4e-3
+    ),
+    "an input, cubic, speeds": Case(
+        lambda: hand("cubic", constraints=[HAND_SPEEDS], between_nodes=True), 0.37374939, kkt=None
+    ),
     "noise of constant strength": Case(lambda: reach(scene=noisy(vp.AdditiveNoise(0.3))), 6.1839502),
     "noise of the controls": Case(lambda: reach(scene=noisy(vp.ControlNoise(0.03))), 2.7760496, kkt=None),
+    "noise of the controls, linear": Case(
+        lambda: reach(scene=noisy(vp.ControlNoise(0.03)), controls="linear"), 2.9337302, kkt=None
+    ),
+    "noise beside an input": Case(
+        lambda: hand("linear", noise=vp.ControlNoise(0.05) + vp.AdditiveNoise(0.01)), 0.16340668, kkt=None
+    ),
     "noise of the controls, torques": Case(
         lambda: reach(scene=noisy(vp.ControlNoise(0.03)), control_limits=([-24.0, -8.0], [24.0, 8.0])),
         # Noise counts by the present cost to go: a swing that costs less without it. Another one costs 3.574 in all.

@@ -6,10 +6,10 @@ import mechanisms
 import numpy as np
 import pinocchio as pin
 import pytest
-from oracles import WORLD
+from oracles import WORLD, slope
+from plan_problems import linear, small
 from refusals import refused
 from scipy.interpolate import CubicHermiteSpline
-from test_sddp import SAMPLINGS, run, sliders, small
 
 import varpin as vp
 from varpin.control.costs import Points
@@ -55,14 +55,9 @@ def plain(residual, J, weight, columns, size):
     return np.einsum("Nr,rs,Ns->N", residual, weight, residual), gradient, hessian
 
 
-def slopes_in_q(function, q, step=1e-2):
-    """Derivative (N, ..., n) of a function of q (N, n), by differences of eighth order."""
-    weights = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
-    columns = [
-        sum(w * (function(q + k * e) - function(q - k * e)) for k, w in weights.items()) / step
-        for e in step * np.eye(q.shape[1])
-    ]
-    return np.stack(columns, axis=-1)
+def slopes_in_q(function, q):
+    """Derivative (N, ..., n) of a function of q (N, n)."""
+    return np.stack([slope(function, q, e, 1e-2) for e in np.eye(q.shape[1])], axis=-1)
 
 
 def masses(robot, q):
@@ -94,13 +89,8 @@ def terms(rng, robot, frame, q, v, u):
     turns *= np.sign(np.linalg.det(turns))[:, None, None]
     error = np.array([pin.log3(target.T @ own) for target, own in zip(turns, R, strict=True)])
     turn = np.array([pin.Jlog3(target.T @ own) for target, own in zip(turns, R, strict=True)])
-    add(
-        vp.FrameOrientationCost(robot, frame, turns, W),
-        W,
-        error,
-        turn @ np.swapaxes(R, 1, 2) @ J[:, 3:],
-        slice(0, n),
-    )
+    of_turn = turn @ np.swapaxes(R, 1, 2) @ J[:, 3:]
+    add(vp.FrameOrientationCost(robot, frame, turns, W), W, error, of_turn, slice(0, n))
     W, twist = spd(rng, 6), rng.normal(size=(N, 6))
     in_q = slopes_in_q(lambda q: (kinematics.jacobians(q)[2] @ v[:, :, None])[..., 0], q)
     slopes = np.concatenate([in_q, J], axis=2)
@@ -124,13 +114,8 @@ def terms(rng, robot, frame, q, v, u):
     for kind, y, begin in ((vp.JointLimitBarrier, q, 0), (vp.VelocityLimitBarrier, v, n)):
         W, lower, upper = spd(rng, n), np.full(n, -0.5), np.linspace(0.3, 0.6, n)
         beyond = y - np.clip(y, lower + 0.1, upper - 0.1)
-        add(
-            kind(robot, W, 0.1, (lower, upper)),
-            W,
-            beyond,
-            np.eye(n) * (beyond != 0.0)[:, None],
-            slice(begin, begin + n),
-        )
+        slopes = np.eye(n) * (beyond != 0.0)[:, None]
+        add(kind(robot, W, 0.1, (lower, upper)), W, beyond, slopes, slice(begin, begin + n))
     return found
 
 
@@ -150,22 +135,19 @@ def test_sums_scale_and_add_up(rng, robot, frame):
     at = samples(rng, robot)
     found = terms(rng, robot, frame, *at)
     factors = rng.uniform(0.5, 2.0, len(found))
+    last = 2 * robot.dof
+    unit = np.eye(last + CONTROLS)[last]
     custom = vp.CustomCost(
         lambda t, q, v, u: u[:, 0] ** 2,
-        lambda t, q, v, u: (
-            2.0 * u[:, :1] * np.eye(2 * robot.dof + CONTROLS)[2 * robot.dof],
-            np.tile(2.0 * np.diag(np.eye(2 * robot.dof + CONTROLS)[2 * robot.dof]), (N, 1, 1)),
-        ),
+        lambda t, q, v, u: (2.0 * u[:, :1] * unit, np.tile(2.0 * np.diag(unit), (N, 1, 1))),
     )
     cost = sum((factor * own for factor, (own, _) in zip(factors, found, strict=True)), start=custom)
     bound = cost.bind(points(robot))
-
     expansion = bound.expand(*at)
     expected = [sum(f * parts[i] for f, (_, parts) in zip(factors, found, strict=True)) for i in range(3)]
-    last = 2 * robot.dof
     expected[0] = expected[0] + at[2][:, 0] ** 2
-    expected[1][:, last] += 2.0 * at[2][:, 0]
-    expected[2][:, last, last] += 2.0
+    expected[1] += 2.0 * at[2][:, :1] * unit
+    expected[2] += 2.0 * np.diag(unit)
     np.testing.assert_allclose(bound.value(*at), expected[0], rtol=1e-12)
     np.testing.assert_allclose(expansion.gradient, expected[1], rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(expansion.hessian, expected[2], rtol=1e-10, atol=1e-10)
@@ -286,9 +268,8 @@ def test_references_in_rows(steps, dt):
         np.testing.assert_allclose(value, 2 * rows[:, 0] ** 2, rtol=1e-15)
     value = vp.ControlCost(1.0, nodes).bind(at).value(zero, zero, zero[:, :2])
     np.testing.assert_allclose(value, 2 * (np.arange(steps) + place) ** 2, rtol=1e-9)
-    end = vp.TrackingCost(np.outer(np.arange(steps + 1.0), np.ones(3))).bind(
-        Points(np.array([dt * steps]), dt * steps, steps, 3, 2)
-    )
+    last = Points(np.array([dt * steps]), dt * steps, steps, 3, 2)
+    end = vp.TrackingCost(np.outer(np.arange(steps + 1.0), np.ones(3))).bind(last)
     np.testing.assert_allclose(end.value(zero[:1], zero[:1], zero[:1, :2]), 3 * steps**2, rtol=1e-12)
 
 
@@ -304,9 +285,6 @@ def test_sums_and_scales():
     for wrong in (lambda: track + 1.0, lambda: 1 + track, lambda: "2" * track, lambda: track * track):
         with pytest.raises(TypeError):
             wrong()
-    built_in = vp.solve(small(vp.TrackingCost([1.0, 0.0], 6.0) + vp.ControlCost(0.2) + vp.Terminal(track)))
-    own = vp.solve(small(2.0 * (vp.TrackingCost([1.0, 0.0], 3.0) + vp.ControlCost(0.1) + vp.Terminal(0.5 * track))))
-    np.testing.assert_allclose(own.controls, built_in.controls, rtol=0, atol=1e-12 * np.abs(built_in.controls).max())
 
 
 def samples_of_a_step(sampling, h):
@@ -322,19 +300,18 @@ def samples_of_a_step(sampling, h):
     return [(0.5 * w, s, motion(s * h), motion(s * h, 1)) for w, s in zip(weights, places, strict=True)]
 
 
-@pytest.mark.parametrize("sampling", SAMPLINGS)
+@pytest.mark.parametrize("sampling", ["midpoint", "gauss", "start"])
 def test_problem_is_an_integral(sampling):
-    """A sum over the samples of each step, and the terminal cost once."""
-    scene = vp.Scene(sliders(2), gravity=False)
+    """A sum over the samples of each step at the plant's time, and the terminal cost once."""
     each_step = vp.TrackingCost(lambda t: [t, 0.0], 2.0) + vp.VelocityCost(0.3) + vp.ControlCost(0.1)
     cost = each_step + vp.Terminal(vp.TrackingCost([1.0, 0.0], 3.0) + vp.VelocityCost(0.7))
-    problem = vp.OptimalControlProblem(scene, cost, [0.3, 0.1], [0.2, 0.0], dt=0.1, steps=8, sampling=sampling)
-    motion = run(problem, np.random.default_rng(0).normal(size=(8, 2)))
+    problem = linear().at(cost=cost, dt=0.1, steps=8, sampling=sampling).at(t0=0.7)
+    motion = problem.simulate(np.random.default_rng(0).normal(size=(8, 2)))
     total = 3 * ((motion.q[-1] - [1.0, 0.0]) ** 2).sum() + 0.7 * (motion.v[-1] ** 2).sum()
     for k in range(8):
         nodes = motion.q[k], motion.v[k], motion.q[k + 1], motion.v[k + 1]
         for weight, place, in_q, in_v in samples_of_a_step(sampling, 0.1):
-            t, q, v = (k + place) * 0.1, np.dot(in_q, nodes), np.dot(in_v, nodes)
+            t, q, v = 0.7 + (k + place) * 0.1, np.dot(in_q, nodes), np.dot(in_v, nodes)
             running = 2 * ((q - [t, 0.0]) ** 2).sum() + 0.3 * (v**2).sum() + 0.1 * (motion.u[k] ** 2).sum()
             total += 0.1 * weight * running
     assert problem.cost_of(motion) == pytest.approx(total, rel=1e-13)
@@ -379,10 +356,6 @@ def test_custom_cost_from_its_value_alone(scale):
     assert np.abs(found.gradient - gradient).max() < 1e-8 * size
     assert np.abs(found.hessian - hessian).max() < 1e-5 * size
     np.testing.assert_array_equal(found.hessian, np.swapaxes(found.hessian, 1, 2))
-    built_in = vp.solve(small(vp.TrackingCost([1.0, 0.0], 2.0) + vp.ControlCost(0.1)))
-    alone = vp.CustomCost(lambda t, q, v, u: 2.0 * ((q - [1.0, 0.0]) ** 2).sum(axis=1))
-    own = vp.solve(small(alone + vp.ControlCost(0.1)))
-    np.testing.assert_allclose(own.controls, built_in.controls, rtol=0, atol=1e-7 * np.abs(built_in.controls).max())
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-3, 0.1, 1.0])
@@ -462,7 +435,6 @@ def test_derivatives_that_cannot_be():
         (lambda: vp.TrackingCost(0.0, np.nan), ("TrackingCost", "weight", "nan")),
         (lambda: vp.TrackingCost(0.0, [1.0, np.inf]), ("weight[1]", "inf")),
         (lambda: vp.TrackingCost(0.0, [[1.0, 2.0], [2.0, 1.0]]), ("positive semidefinite", "-1")),
-        (lambda: vp.VelocityCost([1.0, -2.0]), ("VelocityCost", "weight", "-2")),
         (lambda: vp.ControlCost(np.ones((2, 3))), ("weight", "(2, 3)")),
         (lambda: vp.ControlCost("heavy"), ("ControlCost", "weight", "'heavy'")),
         (lambda: vp.TrackingCost("home"), ("TrackingCost", "reference", "'home'")),
@@ -470,9 +442,7 @@ def test_derivatives_that_cannot_be():
         (lambda: vp.Terminal(vp.Terminal(vp.TrackingCost(0.0))), "Terminal"),
         (lambda: vp.Terminal(1.0), ("Terminal", "float")),
         (lambda: -1.0 * vp.TrackingCost(0.0), "-1"),
-        (lambda: np.nan * vp.TrackingCost(0.0), "nan"),
         (lambda: vp.CustomCost(3), ("CustomCost", "function", "3")),
-        (lambda: vp.CustomCost(None), ("CustomCost", "function", "None")),
         (lambda: vp.CustomCost(smooth, 3.0, name="mine"), ("mine", "derivatives")),
         (lambda: small(vp.ControlCost(1.0, np.zeros((19, 2)))), ("(20, 2)", "(19, 2)")),
         (lambda: small(vp.ControlCost([1.0, 1.0, 1.0])), ("weight", "2", "(3,)")),
@@ -493,7 +463,6 @@ def test_what_is_refused(make, facts):
         (lambda r: vp.FrameVelocityCost(r, "base_link"), ("'base_link'", "'ur5'")),
         (lambda r: vp.JointLimitBarrier("ur5"), "str"),
         (lambda r: vp.FramePositionCost(r, "tool0", [0, 0, 0], [1, 2]), ("FramePositionCost weight", "3")),
-        (lambda r: vp.FrameVelocityCost(r, "tool0", 0.0, -1.0), ("FrameVelocityCost weight", "positive semidefinite")),
         (lambda r: vp.ManipulabilityCost(r, "tool0", 0.1, directions=["x", "x"]), "ManipulabilityCost directions"),
         (lambda r: vp.ManipulabilityCost(r, "tool0", 0.1, directions="up"), "ManipulabilityCost directions"),
         (lambda r: vp.ManipulabilityCost(r, "tool0", 0.0), "ManipulabilityCost least"),
@@ -504,7 +473,6 @@ def test_what_is_refused(make, facts):
         (lambda r: vp.VelocityLimitBarrier(r, limits=(1.0, -1.0)), ("VelocityLimitBarrier", "1", "-1")),
         (lambda r: vp.FramePositionCost(r, "tool0", [0.0, 1.0]), ("FramePositionCost reference", "(3,)")),
         (lambda r: vp.FrameOrientationCost(r, "tool0", 2.0 * np.eye(3)), "rotation"),
-        (lambda r: vp.FrameOrientationCost(r, "tool0", 2.0), "rotation"),
         (lambda r: vp.FrameOrientationCost(r, "tool0", np.diag([1.0, 1.0, -1.0])), "rotation"),
         (lambda r: vp.FrameOrientationCost(r, "tool0", np.full((3, 3), np.nan)), "finite"),
         (lambda r: vp.FrameOrientationCost(r, "tool0", np.eye(4)), ("(3, 3)", "(3, 3, 3)")),
@@ -570,19 +538,6 @@ def test_weights_are_copied_and_frozen():
         cost.weight[0] = 2.0
     # Of rank one, with rounding below zero.
     vp.TrackingCost(0.0, a @ a.T)
-
-
-def test_cost_of_refuses_what_is_no_motion_of_the_problem():
-    scene = vp.Scene(vp.planar_chain(2))
-    problem = vp.OptimalControlProblem(scene, vp.ControlCost(), [0, 0], [0, 0], dt=0.1, steps=3)
-    with refused(vp.InputError, "motion", "varpin.Trajectory"):
-        problem.cost_of(np.zeros((4, 2)))
-    other = vp.simulate(vp.Scene(vp.planar_chain(3)), np.zeros(3), np.zeros(3), dt=0.1, steps=3)
-    with refused(vp.InputError, "joints"):
-        problem.cost_of(other)
-    driven = vp.Scene(vp.planar_chain(2), actuation=[[1.0], [0.0]])
-    with refused(vp.InputError, "1", "2", "controls"):
-        problem.cost_of(vp.simulate(driven, [0, 0], [0, 0], dt=0.1, steps=3))
 
 
 def test_costs_print_in_a_line():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from findings import about
 from mechanisms import slider
-from plan_problems import CAPSULES, TWO
+from plan_problems import CAPSULES, TWO, wave
 from refusals import naming, refused, unnamed
 
 import varpin as vp
@@ -21,19 +21,6 @@ def cart(steps=40, **options):
 
 def target(t):
     return [0.8 * np.sin(1.5 * t), 0.4]
-
-
-def wave(t):
-    return [0.3 * np.sin(2.0 * t), 0.2 * np.sin(3.0 * t), 0.1 * t]
-
-
-def tracking(integrator=None, **options):
-    robot = vp.planar_chain(3)
-    scene = vp.Scene(robot, damping=0.3)
-    cost = vp.TrackingCost(wave, 1e3) + vp.ControlCost(1e-4) + vp.VelocityCost(1e-2)
-    return vp.OptimalControlProblem(
-        scene, cost, np.zeros(3), np.zeros(3), dt=0.02, steps=20, integrator=integrator, **options
-    )
 
 
 def test_a_linear_system_under_a_quadratic_cost_is_a_linear_feedback():
@@ -55,29 +42,15 @@ def test_a_linear_system_under_a_quadratic_cost_is_a_linear_feedback():
 
 
 def test_what_is_planned_begins_where_the_plant_is():
-    run = vp.Mpc(tracking(t0=0.7)).run(vp.Plant(tracking().scene, substeps=4), duration=0.2)
+    run = vp.Mpc(wave(t0=0.7)).run(vp.Plant(wave().scene, substeps=4), duration=0.8)
     assert len(run.plans) == 10
     ticks = run.motion.q[::4]
     np.testing.assert_allclose(run.planned(0.0)[:-1], ticks[:-1], rtol=0, atol=1e-12)
     for k, plan in enumerate(run.plans):
-        np.testing.assert_allclose(run.planned(0.1)[k], plan.trajectory.q[5], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(run.planned(0.4)[k], plan.trajectory.q[5], rtol=0, atol=1e-12)
         np.testing.assert_allclose(run.planned()[k], plan.trajectory.q[-1], rtol=0, atol=1e-12)
         np.testing.assert_array_equal(run.planned(9.0)[k], plan.trajectory.q[-1])
-    np.testing.assert_allclose(run.planned(0.1)[-1], run.plans[-1].trajectory.q[6], rtol=0, atol=1e-12)
-
-
-def test_references_are_those_of_the_plants_time():
-    problem = tracking(sampling="midpoint")
-    moved = problem.at(t0=0.5)
-    assert moved.t0 == 0.5
-    assert problem.at(t0=0.5).at(steps=10).t0 == 0.5
-    motion = vp.solve(problem, max_iterations=0).trajectory
-    times = 0.5 + (np.arange(20) + 0.5) * 0.02
-    q = 0.5 * (motion.q[1:] + motion.q[:-1])
-    v, u = np.diff(motion.q, axis=0) / 0.02, motion.u
-    own = 1e3 * ((q - np.array([wave(t) for t in times])) ** 2).sum(axis=1)
-    own += 1e-2 * (v**2).sum(axis=1) + 1e-4 * (u**2).sum(axis=1)
-    assert moved.cost_of(motion) == pytest.approx(0.02 * own.sum(), rel=1e-12)
+    np.testing.assert_allclose(run.planned(0.4)[-1], run.plans[-1].trajectory.q[6], rtol=0, atol=1e-12)
 
 
 def test_ctrl_c_ends_a_run_while_it_plans():
@@ -117,16 +90,6 @@ def test_ctrl_c_ends_a_run_while_it_plans():
     assert caught.value.trajectory.t[-1] == pytest.approx(3 * 0.05)
 
 
-def test_a_plant_that_fails_keeps_the_motion():
-    mpc = vp.Mpc(tracking(), iterations=1)
-    plant = vp.Plant(
-        vp.Scene(mpc.problem.scene.robot, gravity=(0, 0, -1e6)), vp.Midpoint(guard=vp.Guard(max_halvings=0)), 1
-    )
-    with pytest.raises(vp.StepFailure) as caught:
-        mpc.run(plant, duration=1.0)
-    assert caught.value.trajectory.dt == pytest.approx(0.02)
-
-
 def test_a_run_that_ends_early_tells_of_ticks_without_a_plan():
     """In the warnings of the motion that its error holds: the plant falls out of step, or Ctrl-C."""
 
@@ -163,6 +126,8 @@ def test_a_plan_that_has_no_successor_acts_to_its_end_and_is_held_there(controls
         run = mpc.run(vp.Plant(usual.scene), duration=2.0, progress=lambda tick, _: done.append(tick))
         (told,) = about(run.warnings, kind)
         assert "in 39 of 39 ticks" in told
+        assert ((run.late, run.failed)[kind == "failed ticks"] == (np.arange(40) > 0)).all()
+        assert all(plan is run.plans[0] for plan in run.plans)
         assert naming(run.warnings, "whole horizon", "t = 0.4 s")
         policy, motion, end = run.plans[0].policy_on("velocity"), run.motion, run.plans[0].trajectory
         row, reference = 7, policy.reference[7]
@@ -217,15 +182,15 @@ def test_a_controller_that_cannot_keep_up_says_so(slow, told, monkeypatch):
 
 
 def test_mistakes_are_named():
-    problem = tracking()
+    problem = wave()
     other = vp.Plant(vp.Scene(vp.planar_chain(2)))
     for make, facts in (
         (lambda: vp.Mpc("x"), ("problem", "OptimalControlProblem", "str")),
         (lambda: vp.Mpc(problem, iterations=0), "iterations"),
         (lambda: vp.Mpc(problem, budget=-1.0), "budget"),
         (lambda: vp.Mpc(problem).run(other, duration=1.0), "joints"),
-        (lambda: vp.Mpc(problem).run(duration=0.04).planned(-0.1), ("ahead", "0")),
-        (lambda: vp.Mpc(problem).run(duration=0.04).planned(np.nan), ("ahead", "0")),
+        (lambda: vp.Mpc(problem).run(duration=0.16).planned(-0.1), ("ahead", "0")),
+        (lambda: vp.Mpc(problem).run(duration=0.16).planned(np.nan), ("ahead", "0")),
         (lambda: vp.Mpc(problem).run(duration=0.0), "duration"),
         (lambda: vp.Mpc(problem).run(problem.scene, duration=0.1), ("plant", "varpin.Plant")),
         (lambda: vp.Mpc(problem).run(duration=0.1, rng="a"), "rng"),
@@ -288,10 +253,10 @@ def test_a_problem_at_another_time_and_state_is_that_of_its_grid(cost):
 
 def test_a_shifted_plan_of_linear_controls_is_the_rest_of_it():
     """Along the plan the shifted policy repeats its controls, and holds the last one beyond its end."""
-    plan = vp.solve(tracking(controls="linear").at(steps=8), tolerance=1e-10, check=False)
+    plan = vp.solve(wave(controls="linear", steps=8), tolerance=1e-10, check=False)
     motion, N = plan.trajectory, 8
     for by in (0, 3, N):
-        at = {"q0": motion.q[by], "v0": motion.v[by], "t0": by * 0.02}
+        at = {"q0": motion.q[by], "v0": motion.v[by], "t0": by * 0.08}
         again = plan.problem.at(**at).simulate(plan.shifted(by))
         np.testing.assert_allclose(again.u_nodes[: N + 1 - by], plan.controls[by:], rtol=0, atol=1e-8)
         np.testing.assert_allclose(again.q[: N + 1 - by], motion.q[by:], rtol=0, atol=1e-11)
@@ -306,22 +271,22 @@ def test_a_shifted_plan_of_linear_controls_is_the_rest_of_it():
 @pytest.mark.parametrize("rate", [False, True])
 def test_a_tick_with_linear_controls_is_its_problem_solved_anew(rate):
     """Measured elsewhere than planned: enough iterations from the shifted plan end where a search from nothing does."""
-    problem = tracking(controls="linear", control_limits=(-15.0, 15.0)).at(steps=8)
+    problem = wave(controls="linear", control_limits=(-15.0, 15.0), steps=8)
     if rate:
         problem = problem.at(cost=problem.cost + vp.ControlRateCost(1e-6), control_limits=(-np.inf, np.inf))
     mpc = vp.Mpc(problem, iterations=50, tolerance=1e-13)
     first = mpc.plan(0.0, problem.q0, problem.v0)
     q, v = first.trajectory.q[1] + 0.01, first.trajectory.v[1] - 0.02
-    tick = mpc.plan(0.02, q, v, previous=first)
+    tick = mpc.plan(0.08, q, v, previous=first)
     before = first.controls[1] if rate else None
-    anew = vp.solve(problem.at(q0=q, v0=v, t0=0.02, before=before), tolerance=1e-13, check=False)
+    anew = vp.solve(problem.at(q0=q, v0=v, t0=0.08, before=before), tolerance=1e-13, check=False)
     assert tick.status.converged
     # Costs agree to the tenth digit: controls to the fifth of theirs.
     np.testing.assert_allclose(tick.controls, anew.controls, rtol=0, atol=1e-5 * 15.0)
     assert tick.cost == pytest.approx(anew.cost, rel=1e-10)
     # One iteration has one backward pass, and leaves a part of what the shifted plan has too much.
     start = vp.solve(anew.problem, first.shifted(1, before), max_iterations=0, check=False)
-    quick = vp.Mpc(problem, iterations=1).plan(0.02, q, v, previous=first)
+    quick = vp.Mpc(problem, iterations=1).plan(0.08, q, v, previous=first)
     assert sum(item.backward_passes for item in quick.history) == quick.iterations == 1
     assert anew.cost < quick.cost < anew.cost + 0.2 * (start.cost - anew.cost)
 
@@ -438,21 +403,6 @@ def test_what_the_plant_violates_is_told_of():
     np.testing.assert_array_equal(run.motion.q, again.motion.q)
     assert 0.05 < run.constraints[0].violation < 0.4
     assert naming(run.warnings, "motion violates", "WithinVelocityLimits", "margin=", "narrower")
-
-
-@pytest.mark.parametrize("iterations", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_loops_of_linear_controls_do_not_run_away(iterations):
-    """Speeds of plans and of the plant, and its violations."""
-    fastest, costs = {}, {}
-    for controls in ("held", "linear"):
-        run = vp.Mpc(bounded(SPEEDS, controls=controls), iterations=iterations).run(duration=1.5)
-        plans = max(np.abs(plan.trajectory.v).max() for plan in run.plans)
-        fastest[controls] = max(plans, np.abs(run.motion.v).max())
-        costs[controls] = np.mean([plan.cost for plan in run.plans])
-        assert run.constraints[0].violation <= 1e-2
-        assert max(item.rollouts for plan in run.plans[1:] for item in plan.history) <= 8
-    assert fastest["linear"] <= 1.4 * fastest["held"]
-    assert costs["linear"] <= 1.4 * costs["held"]
 
 
 def test_plans_of_ticks_are_saved_with_their_rows(tmp_path):

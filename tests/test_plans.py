@@ -215,17 +215,3 @@ def test_bundled_scenes_hold(name):
     assert plan.status.converged
     assert plan.warnings == ()
     assert held(plan)
-
-
-def test_regions_that_differ_away_from_the_start_make_another_problem():
-    robot = vp.planar_chain(2)
-    start = robot.frame_positions(np.zeros(2), "tip")
-    one, other = (
-        vp.OptimalControlProblem(
-            vp.Scene(robot), vp.ControlCost(), [0.0, 0.0], [0.0, 0.0], dt=0.02, steps=5,
-            constraints=vp.KeepOutOfSphere(robot, "tip", start + np.array([0.0, 0.0, z]), 0.05),
-        )
-        for z in (0.2, -0.2)
-    )  # fmt: skip
-    assert one.differs(other.setting)
-    assert not one.differs(one.setting)

@@ -113,13 +113,6 @@ def test_each_line_of_the_log_names_its_search(caplog):
 # --- limits of controls ----------------------------------------------------------------------------------------------
 
 
-def test_limits_that_the_optimum_does_not_touch():
-    free, limited = SMALL["held"].plan, vp.solve(reach(control_limits=(-200.0, 200.0)), check=False)
-    assert limited.status.converged
-    assert limited.iterations <= free.iterations + 1
-    np.testing.assert_allclose(limited.controls, free.controls, rtol=0, atol=1e-3)
-
-
 def test_first_controls_are_brought_within_limits():
     problem = reach(control_limits=(-1.0, [0.5, 8.0]))
     wide = vp.LinearPolicy(np.full((12, 2), 3.0), np.zeros((12, 2, 4)), np.zeros((12, 4)))
@@ -129,39 +122,6 @@ def test_first_controls_are_brought_within_limits():
     first = vp.solve(problem, SMALL["held"].plan, max_iterations=0, check=False).controls
     assert ((first >= -1.0) & (first <= [0.5, 8.0])).all()
     np.testing.assert_array_equal(problem.holding_controls(), [-1.0, -1.0])
-
-
-@pytest.mark.parametrize(
-    "integrator", [vp.Midpoint(), vp.Gauss(2), vp.RungeKutta4(), vp.SemiImplicitEuler(), vp.Reference()], ids=str
-)
-def test_feedback_saturates(integrator):
-    """A policy's controls are clipped, whatever integrates: each as the policy by hand gives it at the node."""
-    rng = np.random.default_rng(0)
-    limits = np.array([-0.4, -0.2]), np.array([0.3, 0.1])
-    rows = rng.normal(size=(6, 2)), rng.normal(size=(6, 2, 4)), rng.normal(size=(6, 4))
-    policy = vp.LinearPolicy(*rows, hold=2, limits=limits)
-    motion = vp.simulate(vp.Scene(TWO), [0.1, 0.2], [0, 0], dt=0.05, steps=12, controls=policy, integrator=integrator)
-    x = np.hstack([motion.q, motion.p if integrator.variational else motion.v])[:-1:2]
-    wanted = policy.u + np.einsum("Rmx,Rx->Rm", policy.gains, x - policy.reference)
-    np.testing.assert_allclose(motion.u[::2], np.clip(wanted, *limits), rtol=1e-12)
-    np.testing.assert_array_equal(motion.u[1::2], motion.u[::2])
-    assert ((motion.u == limits[0]) | (motion.u == limits[1])).any()
-
-
-@pytest.mark.parametrize("noise", [vp.AdditiveNoise(0.3), vp.ControlNoise(0.05)], ids=["additive", "control"])
-def test_noise_never_drives_a_control_out_of_its_limits(noise):
-    lower, upper = np.array([-20.0, -6.0]), np.array([20.0, 6.0])
-    plan = vp.solve(reach(scene=noisy(noise), control_limits=(lower, upper)), check=False)
-    assert plan.status.converged
-    paths = vp.simulate_ensemble(
-        plan.problem.scene, REST, REST, dt=0.06, steps=12, paths=50, rng=0, controls=plan.policy
-    )
-    path = vp.simulate(plan.problem.scene, REST, REST, dt=0.06, steps=12, rng=0, controls=plan.policy)
-    assert paths.integrator == path.integrator == str(plan.problem.integrator)
-    assert ((paths.u >= lower) & (paths.u <= upper)).all()
-    saturated, planned = ((u == lower) | (u == upper) for u in (paths.u, plan.controls))
-    assert 0 < planned.sum() < planned.size
-    assert (saturated != planned).any()
 
 
 @pytest.mark.parametrize(

@@ -2,45 +2,64 @@
 
 import numpy as np
 import pytest
+from plan_problems import CAPSULES, TWO, reach, speeds
 from refusals import refused
 
 import varpin as vp
 
 
-def problem_of(*, noise=None, damping=0.2, dt=0.02, weight=0.1, integrator=None, q0=(0.4, -0.3), robot=None, forces=()):
-    robot = vp.planar_chain(2) if robot is None else robot
-    scene = vp.Scene(robot, damping=damping, noise=noise, forces=forces)
-    cost = vp.TrackingCost([0.8, 0.1], 10.0) + vp.ControlCost(weight) + vp.Terminal(vp.VelocityCost(1.0))
-    return vp.OptimalControlProblem(scene, cost, q0, [0.0, 0.0], dt=dt, steps=round(0.6 / dt), integrator=integrator)
+def other(**scene):
+    return reach(scene=vp.Scene(**{"robot": TWO, "damping": 0.1, **scene}))
 
 
-@pytest.mark.parametrize(
-    ("other", "fact"),
-    [
-        ({"dt": 0.03}, "0.03"),
-        ({"q0": (0.4, -0.2)}, "q0"),
-        ({"weight": 0.2}, "cost"),
-        ({"damping": 0.3}, "damping"),
-        ({"noise": vp.AdditiveNoise(0.1)}, "noise"),
-        ({"integrator": vp.Midpoint(alpha=0.4)}, "integrator"),
-        ({"robot": vp.planar_chain(2, mass=2.0)}, "links"),
-        ({"forces": vp.CoulombFriction(1e-3, 1.0)}, "scene"),
-        ({"forces": vp.JointStop(9.0, lower=-1.0, upper=1.0)}, "scene"),
-        ({"forces": vp.Armature(0.1)}, "armature"),
-        ({"forces": vp.FrameWrench("tip", (0.0, 0.0, 0.1, 0.0, 0.0, 0.0))}, "scene"),
-    ],
-)
-def test_a_solution_of_another_problem_is_refused(other, fact, tmp_path):
+def apart(z):
+    start = TWO.frame_positions(np.zeros(2), "tip")
+    return reach(vp.KeepOutOfSphere(TWO, "tip", start + np.array([0.0, 0.0, z]), 0.05))
+
+
+def moving(speed):
+    """In another process the same function has another address."""
+
+    def way(t):
+        return [speed * t, 0.0, 0.0]
+
+    ball = vp.Obstacle.sphere([1.5, 0.0, 0.5], 0.1).moving(way)
+    return reach(vp.KeepInSphere(TWO, "tip", way, 5.0), vp.KeepClear(TWO, [ball], capsules=CAPSULES))
+
+
+# Two problems, and what the errors of files and of the search name.
+PAIRS = {
+    "dt": (reach, lambda: reach(dt=0.03, steps=24), "0.03", "0.03"),
+    "start": (reach, lambda: reach().at(q0=[0.0, 0.1]), "q0", "q0"),
+    "cost": (reach, lambda: reach(more=vp.ControlCost(0.1)), "cost", "cost"),
+    "damping": (reach, lambda: other(damping=0.3), "damping", "damping"),
+    "noise": (reach, lambda: other(noise=vp.AdditiveNoise(0.1)), "noise", "noise"),
+    "integrator": (reach, lambda: reach(integrator=vp.Midpoint(alpha=0.4)), "integrator", "integrator"),
+    "robot": (reach, lambda: other(robot=vp.planar_chain(2, mass=2.0)), "links", "scene"),
+    "friction": (reach, lambda: other(forces=vp.CoulombFriction(1e-3, 1.0)), "scene", "scene"),
+    "stops": (reach, lambda: other(forces=vp.JointStop(9.0, lower=-1.0, upper=1.0)), "scene", "scene"),
+    "armature": (reach, lambda: other(forces=vp.Armature(0.1)), "scene", "armature"),
+    "load": (reach, lambda: other(forces=vp.FrameWrench("tip", (0.0, 0.0, 0.1, 0.0, 0.0, 0.0))), "scene", "scene"),
+    "instants": (
+        lambda: reach(speeds(1.8)), lambda: reach(speeds(1.8), between_nodes=True), "between_nodes", "between_nodes"
+    ),
+    "places away from the start": (lambda: apart(0.2), lambda: apart(-0.2), "constraints", "constraints"),
+    "ways": (lambda: moving(1.0), lambda: moving(1.1), "constraints", "constraints"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_a_solution_of_another_problem_is_refused(name, tmp_path):
     """From a file and to go on from, in both directions."""
-    pair = [problem_of(), problem_of(**other)]
+    *pair, of_file, of_search = PAIRS[name]
     for mine, theirs in (pair, pair[::-1]):
-        plan = vp.solve(mine, max_iterations=1, second_order=True, check=False)
+        plan = vp.solve(mine(), max_iterations=1, check=False)
         path = plan.save(tmp_path / "plan.npz")
-        assert vp.Solution.load(path, mine).cost == plan.cost
-        with refused(vp.FileError, fact if fact != "armature" else "scene"):
-            vp.Solution.load(path, theirs)
-        with refused(vp.InputError, fact if fact != "links" else "scene"):
-            vp.solve(theirs, resume=plan)
+        assert vp.Solution.load(path, mine()).cost == plan.cost
+        with refused(vp.FileError, of_file):
+            vp.Solution.load(path, theirs())
+        with refused(vp.InputError, of_search):
+            vp.solve(theirs(), resume=plan)
 
 
 @pytest.mark.parametrize(
@@ -53,16 +72,16 @@ def test_a_solution_of_another_problem_is_refused(other, fact, tmp_path):
     ],
 )
 def test_numbers_that_no_solution_has(name, change, tmp_path):
-    path = vp.solve(problem_of(), max_iterations=1).save(tmp_path / "plan.npz")
+    path = vp.solve(reach(), max_iterations=1).save(tmp_path / "plan.npz")
     members = dict(np.load(path))
     np.savez(path, **members | {name: change(members[name])})
     with refused(vp.FileError, name.split(".")[-1]):
-        vp.Solution.load(path, problem_of())
+        vp.Solution.load(path, reach())
 
 
 def test_resume_of_something_else():
-    plan = vp.solve(problem_of(), max_iterations=1)
+    plan = vp.solve(reach(), max_iterations=1)
     with refused(vp.InputError, "resume"):
-        vp.solve(problem_of(), plan, resume=plan)
+        vp.solve(reach(), plan, resume=plan)
     with refused(vp.InputError, "Solution"):
-        vp.solve(problem_of(), resume=plan.trajectory)
+        vp.solve(reach(), resume=plan.trajectory)
