@@ -6,7 +6,7 @@ import mechanisms
 import numpy as np
 import pinocchio as pin
 import pytest
-from oracles import WORLD, slope
+from oracles import Mechanism, placements, slope
 from plan_problems import linear, small
 from refusals import refused
 from scipy.interpolate import CubicHermiteSpline
@@ -182,33 +182,18 @@ def tree(seed):
     return vp.load_robot(model)
 
 
-def pinocchio_frame(robot, frame, q, v):
-    """Rotation, position and twist (6,) in world axes, joint by joint in Pinocchio."""
-    model, data = robot.model, robot.model.createData()
-    pin.forwardKinematics(model, data, robot.configuration(q), robot.velocity(v))
-    pin.updateFramePlacements(model, data)
-    index = model.getFrameId(frame)
-    placed = data.oMf[index]
-    return placed.rotation.copy(), placed.translation.copy(), pin.getFrameVelocity(model, data, index, WORLD).vector
-
-
 @pytest.mark.parametrize("name", ["tree0", "tree1", "tree2", "ur5", "panda", "kinova"])
 def test_frames(load, rng, name):
     """Panda's fingers are tied to each other."""
     robot = tree(int(name[4:])) if name.startswith("tree") else load(name)
     frame = "hand" if name.startswith("tree") else robot.end_effector
     q, v, _ = samples(rng, robot)
-    kinematics = frame_kinematics(robot, frame)
+    kinematics, own = frame_kinematics(robot, frame), Mechanism(vp.Scene(robot, damping=0.0))
     R, p, J = kinematics.jacobians(q)
-    gear = robot.velocity(np.eye(robot.dof)).T
-    model, data, index = robot.model, robot.model.createData(), robot.model.getFrameId(frame)
     for k in range(N):
-        rotation, position, twist = pinocchio_frame(robot, frame, q[k], v[k])
-        np.testing.assert_allclose(R[k], rotation, atol=1e-13)
-        np.testing.assert_allclose(p[k], position, atol=1e-13)
-        np.testing.assert_allclose(J[k] @ v[k], twist, atol=1e-12)
-        whole = pin.computeFrameJacobian(model, data, robot.configuration(q[k]), index, WORLD)
-        np.testing.assert_allclose(J[k], whole @ gear, atol=1e-13)
+        own.place(q[k], v[k])
+        for found, expected in zip((p[k], R[k], J[k]), own.point(frame), strict=False):
+            np.testing.assert_allclose(found, expected, atol=1e-13)
     for placed, once_more in zip(kinematics.placements(q), (R, p), strict=True):
         np.testing.assert_array_equal(placed, once_more)
 
@@ -223,7 +208,7 @@ def test_orientation_at_every_distance(load, angle, axis):
     """The rotation vector from the target is exact, and its derivative, near no turn and near half a turn, too."""
     robot = load("ur5")
     q, v = np.random.default_rng(2).uniform(-1.5, 1.5, (2, 1, 6))
-    R = pinocchio_frame(robot, "tool0", q[0], v[0])[0]
+    R = placements(robot, q, "tool0")[0].rotation
     axis = np.array(axis) / np.linalg.norm(axis)
     W = np.diag([1.0, 2.0, 3.0])
     bound = vp.FrameOrientationCost(robot, "tool0", R @ turn(axis, angle).T, W).bind(Points(np.zeros(1), 1.0, 1, 6, 6))
@@ -241,7 +226,7 @@ def test_targets_in_time(load, rng):
     robot, steps = load("ur5"), 4
     t, nodes = (np.arange(steps) + 0.5) * 0.25, np.linspace(0.0, 1.0, steps + 1)
     q, v = rng.uniform(-1.5, 1.5, (2, steps, 6))
-    at = [pinocchio_frame(robot, "tool0", *row) for row in zip(q, v, strict=True)]
+    at = placements(robot, q, "tool0")
 
     def path(t):
         return np.array([t, 1.0 - t, 0.3])
@@ -249,8 +234,8 @@ def test_targets_in_time(load, rng):
     def turning(t):
         return turn([1, 1, 0], 2.0 * t)
 
-    away = [((p - path(time)) ** 2).sum() for time, (_, p, _) in zip(t, at, strict=True)]
-    turned = [(pin.log3(turning(time).T @ R) ** 2).sum() for time, (R, _, _) in zip(t, at, strict=True)]
+    away = [((place.translation - path(time)) ** 2).sum() for time, place in zip(t, at, strict=True)]
+    turned = [(pin.log3(turning(time).T @ place.rotation) ** 2).sum() for time, place in zip(t, at, strict=True)]
     for kind, target, expected in ((vp.FramePositionCost, path, away), (vp.FrameOrientationCost, turning, turned)):
         for given in (target, np.array([target(time) for time in nodes])):
             bound = kind(robot, "tool0", given).bind(Points(t, 1.0, steps, 6, 6))

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 from findings import about
 from plan_problems import CAPSULES, SMALL, TWO, reach, speeds, tip
-from refusals import naming, refused, unnamed
+from refusals import refused, unnamed
 from scipy.integrate import solve_ivp
 from threadpoolctl import threadpool_info, threadpool_limits
 
@@ -229,63 +229,6 @@ def test_scene_files(tmp_path):
             vp.load_scene(path)
 
 
-@pytest.mark.parametrize("family", ["velocities", "positions"])
-@pytest.mark.parametrize(("damping", "fast"), [(200.0, True), (0.2, False)])
-def test_a_margin_of_velocities_under_fast_damping_is_told_of(family, damping, fast):
-    """The variances of velocities are too small there; those of positions are not."""
-    scene = vp.Scene(TWO, damping=damping, noise=vp.AdditiveNoise(0.1))
-    bound = {
-        "velocities": vp.WithinVelocityLimits(TWO, (-20.0, 20.0), margin=2.0),
-        "positions": vp.WithinJointLimits(TWO, (-20.0, 20.0), margin=2.0),
-    }[family]
-    plan = vp.solve(reach(bound, steps=8, scene=scene, integrator=vp.Radau(2, kick="held")))
-    assert bool(naming(plan.warnings, "WithinVelocityLimits", "margin", "standard deviation")) == (
-        fast and family == "velocities"
-    )
-
-
-def test_a_margin_without_noise_is_told_of():
-    plan = vp.solve(reach(vp.WithinVelocityLimits(TWO, (-2.0, 2.0), margin=2.0)))
-    assert naming(plan.warnings, "margin", "noise")
-
-
-def test_what_is_told_before_a_search():
-    """What no motion meets, or looks like other units, is named, and these alone; what can be met is not."""
-    given = {
-        ("2.1 m", "2 m"): [vp.ReachFrame(TWO, "tip", position=[2.1, 0.0, 0.0])],
-        ("millimetres",): [vp.ReachFrame(TWO, "tip", position=[1200.0, 0.0, -900.0])],
-        ("90 rad",): [vp.WithinJointLimits(TWO, (10.0, 90.0)), vp.ReachFrame(TWO, "tip", position=[3.0, 0.0, 0.0])],
-        ("joint1", "0.2 rad", "WithinJointLimits"): [vp.WithinJointLimits(TWO, (-1.0, 0.8))],
-        ("joint1", "table", "0.01"): [
-            vp.KeepClear(
-                TWO,
-                [vp.Obstacle.sphere([0.0, 0.0, -0.1], 0.06, name="table")],
-                capsules={"joint1": CAPSULES["joint1"]},
-            )
-        ],
-    }
-    for facts, constraints in given.items():
-        (told,) = checks.foreseen(reach(*constraints))
-        assert not unnamed(told, facts)
-    for name, case in SMALL.items():
-        assert "joints" in name or not naming(checks.foreseen(case.problem), "WithinJointLimits"), name
-    degrees = vp.ControlCost(1e-2) + vp.Terminal(2.0 * vp.TrackingCost([60.0, 30.0], 1.0))
-    (told,) = checks.foreseen(reach(speeds(1.2)).at(cost=degrees, control_limits=(-1.0, 1.0)))
-    assert "60 rad" in told
-
-
-def test_wide_limits_of_the_description_are_in_radians():
-    model = vp.planar_chain(1).model.copy()
-    model.lowerPositionLimit[:], model.upperPositionLimit[:] = -1e5, 1e5
-    robot = vp.load_robot(model)
-    for given, told in ((None, 0), ((-180.0, 180.0), 1)):
-        constraints = [vp.WithinJointLimits(robot, given)]
-        problem = vp.OptimalControlProblem(
-            vp.Scene(robot, gravity=False), vp.ControlCost(1.0), [0], [0], dt=0.02, steps=10, constraints=constraints
-        )
-        assert [found.kind for found in checks.foreseen(problem)] == ["limits in degrees"] * told
-
-
 ARMS = ("ur3", "ur5", "ur10", "panda", "z1", "xarm7", "kinova", "so100", "talos_arm", "finger")
 
 
@@ -311,24 +254,6 @@ def test_reach_bounds_where_a_frame_gets(name):
         told = [finding for finding in checks.foreseen(problem) if finding.kind == "goal out of reach"]
         assert len(told) == (not reached)
         assert reached or not unnamed(told[0], (frame, f"{1.01 * most:.4g} m", f"{most:.4g} m"))
-
-
-def test_targets_out_of_reach():
-    """Rows count, too, but only directions with a weight; a base on free rails gets anywhere."""
-
-    def told(robot, target, **options):
-        cost = vp.ControlCost(1e-3) + vp.FramePositionCost(robot, "tip", target, **options)
-        rest = np.zeros(robot.dof)
-        plan = vp.solve(vp.OptimalControlProblem(vp.Scene(robot), cost, rest, rest, dt=0.1, steps=2), max_iterations=1)
-        return about(plan.warnings, "goal out of reach")
-
-    robot, mobile = vp.planar_chain(2), vp.load_robot(vp.planar_chain(2).model, base="planar")
-    assert told(robot, [2.1, 0.0, 0.0])
-    assert told(robot, [2.1, 5.0, 0.0], weight=[1.0, 0.0, 1.0])
-    assert not told(robot, [1.9, 5.0, 0.0], weight=[1.0, 0.0, 1.0])
-    assert told(robot, np.linspace([1.0, 0.0, 0.0], [2.1, 0.0, 0.0], 3))
-    assert not told(robot, np.linspace([1.0, 0.0, 0.0], [1.9, 0.0, 0.0], 3))
-    assert not told(mobile, [30.0, 5.0, 0.0])
 
 
 def test_references_of_rows_go_with_constraints():

@@ -145,34 +145,97 @@ def limited(share):
     return {"control_limits": (-share * WEIGHT, share * WEIGHT)}
 
 
-def tip(x):
-    return vp.FramePositionCost(vp.planar_chain(1), "tip", (x, 0.0, 0.0))
+def tip(target, weight=1.0):
+    return {"cost": vp.ControlCost() + vp.FramePositionCost(LINK, "tip", target, weight)}
+
+
+def end(target):
+    return {"cost": vp.ControlCost() + vp.Terminal(vp.TrackingCost([target]))}
+
+
+def goal(x):
+    return {"constraints": vp.ReachFrame(LINK, "tip", position=[x, 0.0, 0.0])}
+
+
+def joints(lower, upper):
+    return {"constraints": vp.WithinJointLimits(LINK, (lower, upper)), "q0": [-0.5]}
+
+
+LINK = vp.planar_chain(1)
+TABLE = vp.Obstacle.sphere([0.0, 0.0, -0.1], 0.06, name="table")
+CLEAR = vp.KeepClear(LINK, [TABLE], capsules={"joint1": ([0, 0, 0], [1, 0, 0], 0.05)})
+FIXED, ACROSS = vp.Terminal(vp.FramePositionCost(LINK, "tip", (1.0, 0.0, 0.0))), [1.0, 0.0, 1.0]
 
 
 @pytest.mark.parametrize(
-    ("options", "kind", "times"),
+    ("options", "kind", "times", "facts"),
     [
-        (limited(0.8), "limits below the weight", 2),
-        ({**limited(0.8), "q0": [-np.pi / 2]}, "limits below the weight", 1),
-        ({**limited(0.8), "v0": [1.0]}, "limits below the weight", 1),
-        (limited(1.005), "limits below the weight", 0),
-        (limited(0.995), "limits below the weight", 0),
-        ({"dt": 0.5}, "step in milliseconds", 1),
-        ({"dt": 0.3}, "step in milliseconds", 0),
-        ({"q0": [90.0]}, "start in degrees", 1),
-        ({"cost": vp.ControlCost() + vp.Terminal(vp.TrackingCost([90.0]))}, "goal in degrees", 1),
-        ({"cost": vp.ControlCost() + vp.Terminal(vp.TrackingCost([3.0]))}, "goal in degrees", 0),
+        (limited(0.8), "limits below the weight", 2, "'joint1'"),
+        ({**limited(0.8), "q0": [-np.pi / 2]}, "limits below the weight", 1, ()),
+        ({**limited(0.8), "v0": [1.0]}, "limits below the weight", 1, ()),
+        (limited(1.005), "limits below the weight", 0, ()),
+        (limited(0.995), "limits below the weight", 0, ()),
+        ({"dt": 0.5}, "step in milliseconds", 1, "0.5 s"),
+        ({"dt": 0.3}, "step in milliseconds", 0, ()),
+        ({"q0": [90.0]}, "start in degrees", 1, "90 rad"),
+        (end(90.0), "goal in degrees", 1, "90 rad"),
+        (end(3.0), "goal in degrees", 0, ()),
+        (joints(-10.0, 90.0), "limits in degrees", 1, "90 rad"),
+        (joints(-10.0, 3.0), "limits in degrees", 0, ()),
+        (joints(-1.0, -0.2), "goal outside constraints", 1, ("joint1", "0.2 rad", "WithinJointLimits")),
+        (joints(-1.0, 0.1), "goal outside constraints", 0, ()),
+        ({"constraints": CLEAR}, "start outside constraints", 1, ("joint1", "table", "0.01")),
+        (goal(1.1), "goal out of reach", 1, ("1.1 m", "1 m")),
+        (goal(0.9), "goal out of reach", 0, ()),
+        (goal(700.0), "goal in millimetres", 1, "700 m"),
         # The last one can be reached.
-        ({"cost": vp.ControlCost() + tip(5.0) + vp.Terminal(tip(1.0))}, "goal out of reach", 1),
-        ({"cost": vp.ControlCost() + tip(0.7)}, "goal out of reach", 0),
-        ({"cost": vp.ControlCost() + tip(700.0)}, "goal in millimetres", 1),
+        ({"cost": tip((5.0, 0.0, 0.0))["cost"] + FIXED}, "goal out of reach", 1, ()),
+        (tip((0.7, 0.0, 0.0)), "goal out of reach", 0, ()),
+        (tip((700.0, 0.0, 0.0)), "goal in millimetres", 1, ()),
+        # Rows count, too, but only directions with a weight.
+        (tip((1.1, 5.0, 0.0), ACROSS), "goal out of reach", 1, ()),
+        (tip((0.9, 5.0, 0.0), ACROSS), "goal out of reach", 0, ()),
+        (tip(np.linspace([0.5, 0.0, 0.0], [1.1, 0.0, 0.0], 11)), "goal out of reach", 1, ()),
+        (tip(np.linspace([0.5, 0.0, 0.0], [0.9, 0.0, 0.0], 11)), "goal out of reach", 0, ()),
     ],
 )
-def test_what_cannot_be_is_said_first(options, kind, times, caplog):
-    """Before the search in the log, and first in the plan's warnings."""
+def test_what_cannot_be_is_said_first(options, kind, times, facts, caplog):
+    """Before the search in the log, and first in the plan's warnings; what can be is not."""
     told = vp.solve(small(**options), max_iterations=0).warnings
     assert [finding.kind for finding in told].count(kind) == times
     assert not times or (told[0].kind == kind and told[0] in caplog.messages[0])
+    assert not times or not unnamed(told[0], facts)
+
+
+def test_limits_of_the_description_are_in_radians_and_rails_go_anywhere():
+    model = LINK.model.copy()
+    model.lowerPositionLimit[:], model.upperPositionLimit[:] = -1e5, 1e5
+    wide, mobile = vp.load_robot(model), vp.load_robot(LINK.model, base="planar")
+    far = vp.ControlCost() + vp.FramePositionCost(mobile, "tip", [30.0, 5.0, 0.0])
+    for robot, cost, constraints in ((wide, vp.ControlCost(), vp.WithinJointLimits(wide)), (mobile, far, ())):
+        at, scene = np.zeros(robot.dof), vp.Scene(robot, gravity=False)
+        problem = vp.OptimalControlProblem(scene, cost, at, at, dt=0.02, steps=10, constraints=constraints)
+        assert vp.solve(problem, max_iterations=0).warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("bound", "damping", "kind"),
+    [
+        (vp.WithinVelocityLimits, 200.0, "margins of velocities"),
+        (vp.WithinVelocityLimits, 0.2, None),
+        (vp.WithinJointLimits, 200.0, None),
+        (vp.WithinVelocityLimits, None, "margin without noise"),
+    ],
+)
+def test_margins_that_may_be_wrong_are_told_of(bound, damping, kind):
+    """The variances of velocities are too small under dampers that are faster than the step."""
+    noise = None if damping is None else vp.AdditiveNoise(0.1)
+    scene = vp.Scene(LINK, damping=damping or 0.0, noise=noise)
+    within = bound(LINK, (-20.0, 20.0), margin=2.0)
+    given = {"dt": 0.05, "steps": 8, "integrator": vp.Radau(2, kick="held"), "constraints": within}
+    plan = vp.solve(vp.OptimalControlProblem(scene, vp.ControlCost(), [0.0], [0.0], **given))
+    assert [told.kind for told in plan.warnings if "margin" in told.kind] == ([kind] if kind else [])
+    assert not kind or naming(plan.warnings, "margin")
 
 
 def test_a_constraint_of_ones_own_may_have_any_attributes():

@@ -7,8 +7,8 @@ import re
 import numpy as np
 import pytest
 from findings import about
-from mechanisms import slider
-from plan_problems import CAPSULES, REST, SMALL, TWO, noisy, reach
+from oracles import kkt
+from plan_problems import CAPSULES, REST, SMALL, TWO, linear, noisy, reach
 from refusals import naming, refused
 
 import varpin as vp
@@ -149,14 +149,12 @@ def line(end, steps=12):
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"integrator": vp.RungeKutta4()}, {"hold": 5}, {"sampling": "midpoint"}, {"integrator": vp.Radau(2)}],
+    [{}, {"integrator": vp.RungeKutta4()}, {"hold": 4}, {"sampling": "midpoint"}, {"integrator": vp.Radau(2)}],
 )
 def test_a_linear_problem_takes_one_step(options):
-    scene = vp.Scene(slider(2.0), gravity=False, stiffness=3.0, damping=0.1)
-    cost = vp.ControlCost(0.1) + vp.VelocityCost(0.1)
-    cost += vp.Terminal(vp.TrackingCost([1.0], 100.0) + vp.VelocityCost(10.0))
-    problem = vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=0.04, steps=50, **options)
-    own, found = vp.solve(problem), vp.solve(problem, states=line([1.0], 50))
+    problem = linear(**options)
+    away = np.linspace(problem.q0, [1.0, 0.5], problem.steps + 1)
+    own, found = vp.solve(problem, check=False), vp.solve(problem, states=away, check=False)
     assert found.status.converged
     assert [row.step for row in found.history] == [1.0, 0.0]
     assert found.cost == pytest.approx(own.cost, rel=1e-12)
@@ -270,10 +268,7 @@ def test_drives_at_their_limits_take_second_derivatives(tmp_path):
     problem, motion = plan.problem, plan.trajectory
     demand = (STIFFNESS * (motion.u - motion.q[:-1]) - DAMPING * motion.v[:-1]) / [105.0, 35.0]
     assert np.abs(demand).max() > 1.1
-    for seed in range(3):
-        way = np.random.default_rng(seed).normal(size=motion.u.shape)
-        ahead, behind = (problem.cost_of(problem.simulate(motion.u + step * way)) for step in (1e-5, -1e-5))
-        assert abs(ahead - behind) / 2e-5 < 1e-3 * np.linalg.norm(way)
+    assert kkt(plan) <= 1e-4
     orders = [row.second_order for row in plan.history]
     assert (orders[0], orders[-1]) == (False, True)
     assert [str(row).endswith("*") for row in plan.history] == orders

@@ -116,20 +116,27 @@ def test_a_loss_within_the_wish_is_no_warning() -> None:
     assert naming(vp.solve(plan.problem, plan.controls).warnings, "in quarters of dt")
 
 
-@pytest.mark.parametrize("controls", ["held", "linear"])
-@pytest.mark.parametrize("limited", [False, True], ids=["free", "within speeds"])
-def test_the_first_step_within_the_wish_is_taken(controls: str, limited: bool) -> None:
-    within = [vp.WithinVelocityLimits(vp.planar_chain(2), (-2.0, 2.0))] if limited else []
-    problem = reach(6 if limited else 3, controls, constraints=within)
-    plan = vp.solve(problem, true_cost=1e-3)
+LIMITED = {"constraints": vp.WithinVelocityLimits(vp.planar_chain(2), (-2.0, 2.0))}
+
+
+@pytest.mark.parametrize(
+    ("problem", "wish"),
+    [(reach(3), 1e-4), (reach(3, "linear"), 1e-4), (reach(12, **LIMITED), 1e-2)],
+    ids=["held", "linear", "within speeds"],
+)
+def test_the_first_step_within_the_wish_is_taken(problem: vp.OptimalControlProblem, wish: float) -> None:
+    """Within speeds the first step costs little, and violates them by more than a thousandth of their range."""
+    plan = vp.solve(problem, true_cost=wish)
     found, truth = plan.refinement, plan.verify()
     assert found.met
     assert found.chosen == len(found.tried) - 1 >= 1
     assert plan.status.converged
-    assert abs(truth.closed_loop_loss) <= 1e-3
-    assert all(told.closed_loop <= 1e-2 for told in truth.constraints)
-    assert all(max(abs(row.loss), row.excess, row.violation) > 1e-3 for row in found.tried[:-1])
-    assert found.tried[-1].excess <= 1e-3
+    assert abs(truth.closed_loop_loss) <= wish
+    beyond = max((told.closed_loop for told in truth.constraints), default=0.0)
+    assert found.tried[-1].violation == pytest.approx(beyond / 4.0, rel=1e-2)
+    assert beyond / 4.0 <= 1e-3
+    assert all(abs(row.loss) > wish or row.excess > wish or row.violation > 1e-3 for row in found.tried[:-1])
+    assert found.tried[-1].excess <= wish
     np.testing.assert_allclose([row.dt for row in found.tried], problem.dt / 2.0 ** np.arange(len(found.tried)))
     assert plan.problem.steps == found.tried[-1].steps == plan.trajectory.steps
     assert str(found) in plan.table()
@@ -138,4 +145,4 @@ def test_the_first_step_within_the_wish_is_taken(controls: str, limited: bool) -
     assert plan.cost == pytest.approx(cold.cost, rel=1e-5)
     # Its controls cost no more than the wish above those of a far finer step.
     best = vp.solve(problem.at(dt=plan.problem.dt / 4), check=False).cost
-    assert truth.closed_loop_cost <= (1.0 + 2e-3) * best
+    assert truth.closed_loop_cost <= (1.0 + 2.0 * wish) * best
