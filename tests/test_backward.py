@@ -19,7 +19,6 @@ EXTREMES = (1e-9, 1.0, 1e9)
 
 
 def random_steps(dof, m, k, *, seed, steps=6):
-    """Steps for a backward pass with nothing special about them, every Hessian positive definite."""
     rng = np.random.default_rng(seed)
     x, size = 2 * dof, 2 * dof + m
 
@@ -39,7 +38,6 @@ def random_steps(dof, m, k, *, seed, steps=6):
 
 
 def empty(given, hold):
-    """Arrays for a pass to fill in."""
     (N, x, m), k = given["B"].shape, given["G"].shape[2]
     R = N // hold
     return {
@@ -144,7 +142,6 @@ def test_two_blocks_are_one_pass():
 @pytest.mark.parametrize("hold", [1, 3])
 @pytest.mark.parametrize("limited", [False, True])
 def test_the_linearized_motion_under_gains_is_the_sum_of_its_steps(hold, limited):
-    """With controls that are clipped to their slack, and the states after all steps, also within a decision."""
     given = random_steps(2, 2, 0, seed=4)
     A, B, R, rng = given["A"], given["B"], 6 // hold, np.random.default_rng(5)
     slack = np.zeros((0, 2, 2))
@@ -195,7 +192,6 @@ def exact(array):
 
 
 def solved(A, B):
-    """Gaussian elimination, column by column."""
     A, B, n = A.copy(), B.copy(), len(A)
     for k in range(n):
         for i in range(k + 1, n):

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from findings import about
 from oracles import rollout
+from plan_problems import CAPSULES
+from refusals import refused
 from scipy.optimize import minimize
 
 import varpin as vp
@@ -21,7 +23,6 @@ def reach(limit=LIMIT, **options):
 
 
 def speeds(problem, u, parts):
-    """Speeds along the motion under decisions u (R, 2), in classical Runge-Kutta steps."""
     lines = problem.controls == "linear"
     controls = vp.FirstOrderHold(u).refined(parts) if lines else np.repeat(u, parts, axis=0)
     given = {"dt": DT / parts, "steps": N * parts, "controls": controls, "check": False}
@@ -30,7 +31,6 @@ def speeds(problem, u, parts):
 
 @pytest.mark.parametrize(("controls", "close"), [("held", 1e-4), ("linear", 1e-3)])
 def test_speeds_hold_between_nodes_at_least_cost(controls, close):
-    """Beside SLSQP with the limits at 16 instants of each step."""
     problem = reach(controls=controls)
     plan = vp.solve(problem)
     assert plan.status is vp.Status.CONVERGED, plan.reason
@@ -52,6 +52,41 @@ def test_speeds_between_nodes_that_nobody_asks_for_are_told():
     assert "between_nodes=True" in told
 
 
+def apart(z):
+    start = ROBOT.frame_positions(np.zeros(2), "tip")
+    return reach(constraints=vp.KeepOutOfSphere(ROBOT, "tip", start + np.array([0.0, 0.0, z]), 0.05))
+
+
+def moving(speed):
+    """In another process the same function has another address."""
+
+    def way(t):
+        return [speed * t, 0.0, 0.0]
+
+    ball = vp.Obstacle.sphere([1.5, 0.0, 0.5], 0.1).moving(way)
+    clear = vp.KeepClear(ROBOT, [ball], capsules=CAPSULES)
+    return reach(constraints=[vp.KeepInSphere(ROBOT, "tip", way, 5.0), clear])
+
+
+@pytest.mark.parametrize(
+    ("build", "one", "other", "fact"),
+    [
+        (lambda between: reach(between_nodes=between), True, False, "between_nodes"),
+        (apart, 0.2, -0.2, "constraints"),
+        (moving, 1.0, 1.1, "constraints"),
+    ],
+    ids=["instants", "places away from the start", "ways"],
+)
+def test_plans_within_other_constraints_are_refused(build, one, other, fact, tmp_path):
+    plan = vp.solve(build(one), max_iterations=1, check=False)
+    path = plan.save(tmp_path / "plan.npz")
+    assert vp.Solution.load(path, build(one)).cost == plan.cost
+    with refused(vp.FileError, fact):
+        vp.Solution.load(path, build(other))
+    with refused(vp.InputError, fact):
+        vp.solve(build(other), resume=plan, check=False)
+
+
 def test_copies_and_files_know_the_option(tmp_path):
     problem, alone = reach(), reach(between_nodes=False)
     for copy in (problem.at(dt=DT / 2), problem.at(q0=[0.1, 0.0]), problem.at(controls="linear")):
@@ -62,5 +97,3 @@ def test_copies_and_files_know_the_option(tmp_path):
     with np.load(plan.save(tmp_path / "plan.npz")) as archive:
         np.savez(tmp_path / "older.npz", **{name: archive[name] for name in archive if name != "between_nodes"})
     assert vp.Solution.load(tmp_path / "older.npz", alone).controls.tobytes() == plan.controls.tobytes()
-    with pytest.raises(vp.InputError, match="between_nodes"):
-        reach(between_nodes="yes")

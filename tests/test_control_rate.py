@@ -1,12 +1,9 @@
 """The cost of changing controls: dense minima, a plain Riccati recursion, simulated noise, and what hands it on."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from oracles import rollout
 from plan_problems import linear, sliders
-from refusals import refused
 
 import varpin as vp
 
@@ -15,7 +12,6 @@ BEFORE = np.array([0.7, -0.3])
 
 
 def plain_rate(u, weight, before, period):
-    """Change by change."""
     W = np.asarray(weight) * np.eye(u.shape[1]) if np.ndim(weight) < 2 else np.asarray(weight)
     total, last = 0.0, before
     for row in u:
@@ -43,19 +39,6 @@ def test_value(weight, before, hold):
     np.testing.assert_allclose(rated.costs(*many), rated.cost_of(motion), rtol=1e-12)
 
 
-def test_noise_is_known_to_the_law():
-    """The expected cost on a linear system is exact: against simulated paths, which feed the control before back."""
-    problem = linear(vp.ControlRateCost(MATRIX, BEFORE), noise=vp.AdditiveNoise(0.3) + vp.ControlNoise(0.2), hold=2)
-    sol = vp.solve(problem)
-    found = sol.monte_carlo(4000, rng=0)
-    assert abs(found.cost - found.predicted) < 4.0 * found.standard_error
-    assert sol.noise_cost > 10.0 * found.standard_error
-    # Under the same noise feedback on x alone costs more.
-    blind = dataclasses.replace(sol, previous_gains=np.zeros_like(sol.previous_gains))
-    lost = blind.monte_carlo(4000, rng=0)
-    assert lost.cost > found.cost + 4.0 * found.standard_error
-
-
 def random_policy(scene, steps, hold=1, before=None, limits=None):
     rng = np.random.default_rng(5)
     n, m = scene.robot.dof, scene.controls
@@ -74,7 +57,6 @@ def random_policy(scene, steps, hold=1, before=None, limits=None):
     ids=str,
 )
 def test_policies_feed_the_control_before_back(monkeypatch, integrator, limits, before):
-    """In the core, in SciPy's integrator, and across the pieces that a long simulation is made in."""
     monkeypatch.setattr("varpin.simulation.simulate._CHUNK", 8)
     scene = vp.Scene(sliders(2), gravity=False, damping=0.3)
     policy = random_policy(scene, 10, 2, before, limits)
@@ -95,7 +77,6 @@ def test_policies_feed_the_control_before_back(monkeypatch, integrator, limits, 
 @pytest.mark.parametrize("limits", [None, (-0.8, 0.8)], ids=["free", "limited"])
 @pytest.mark.parametrize("before", [None, BEFORE], ids=["free", "given"])
 def test_ensembles_feed_the_control_before_of_each_path_back(before, limits):
-    """The same bytes as paths by themselves, in several groups."""
     scene = vp.Scene(sliders(2), gravity=False, damping=0.3, noise=vp.AdditiveNoise(0.4))
     policy = random_policy(scene, 20, before=before, limits=limits)
     options = {"dt": 0.05, "steps": 20, "controls": policy}
@@ -106,18 +87,6 @@ def test_ensembles_feed_the_control_before_of_each_path_back(before, limits):
             alone = vp.simulate(scene, [0.3, -0.4], [0.5, 0.1], rng=child, **options)
             assert alone.u.tobytes() == paths.u[path].tobytes()
             assert alone.q.tobytes() == paths.q[path].tobytes()
-
-
-def test_the_rest_of_an_optimum_is_the_optimum_of_the_rest():
-    """From the control that acted before, and from no other."""
-    problem = linear(vp.ControlRateCost(MATRIX), hold=2)
-    whole = vp.solve(problem, tolerance=1e-14)
-    motion, j = whole.trajectory, 8
-    later = problem.at(q0=motion.q[j], v0=motion.v[j], steps=24 - j, t0=problem.dt * j)
-    rest = vp.solve(later.at(before=whole.controls[3]), tolerance=1e-14)
-    np.testing.assert_allclose(rest.controls, whole.controls[4:], rtol=0, atol=1e-7)
-    other = vp.solve(later, tolerance=1e-14)
-    assert np.abs(other.controls - whole.controls[4:]).max() > 1e-2
 
 
 def test_feedback_on_another_start_and_another_control_before():
@@ -140,7 +109,6 @@ def test_feedback_on_another_start_and_another_control_before():
 
 
 def test_mpc_joins_its_plans():
-    """Each tick's plan begins at the control that acted, and the first one at that of the cost, if it has one."""
     for before in (BEFORE, None):
         problem = linear(vp.ControlRateCost(0.1, before), q0=(0.0, 0.0))
         robot, actuation = problem.scene.robot, problem.scene.actuation
@@ -153,11 +121,6 @@ def test_mpc_joins_its_plans():
     np.testing.assert_array_equal(again.problem.rate.before, run.plans[0].controls[1])
 
 
-class Wrapped(vp.Cost):
-    def bind(self, points):
-        return vp.ControlRateCost(1.0).bind(points)
-
-
 def test_sums_scales_and_words():
     own = vp.ControlRateCost(2.0)
     assert own.of_controls
@@ -165,45 +128,3 @@ def test_sums_scales_and_words():
     assert repr(vp.ControlRateCost([1.0, 2.0], 0.5)) == "ControlRateCost(weight=[1.0, 2.0], before=0.5)"
     np.testing.assert_array_equal(linear(vp.ControlRateCost(1.0, 0.5)).rate.before, [0.5, 0.5])
     np.testing.assert_array_equal(linear(2.0 * own + vp.ControlRateCost([1.0, 3.0])).rate.weight, np.diag([5.0, 7.0]))
-
-
-@pytest.mark.parametrize(
-    ("make", "facts"),
-    [
-        (lambda: vp.ControlRateCost(-1.0), ("ControlRateCost", "weight", "positive semidefinite")),
-        (lambda: linear(vp.ControlRateCost(1.0, np.nan)), ("ControlRateCost", "before", "nan")),
-        (
-            lambda: linear(vp.ControlRateCost(1.0, np.zeros((2, 2)))),
-            ("before", "(2, 2)"),
-        ),
-        (lambda: vp.Terminal(vp.ControlRateCost()), ("ControlRateCost", "terminal")),
-        (lambda: linear(Wrapped()), "cost"),
-        (lambda: linear(vp.ControlRateCost([1.0, 1.0, 1.0])), ("2", "(3,)")),
-        (lambda: linear(vp.ControlRateCost(1.0, np.zeros(3))), ("before", "(2,)", "(3,)")),
-        (
-            lambda: linear(vp.ControlRateCost() + vp.ControlRateCost(1.0, BEFORE)),
-            ("ControlRateCost", "before"),
-        ),
-        (
-            lambda: linear().at(before=BEFORE),
-            ("before", "ControlRateCost", "WithinControlRate"),
-        ),
-        (lambda: linear(vp.ControlRateCost()).at(before=np.zeros(3)), ("before", "(2,)", "(3,)")),
-        (
-            lambda: vp.LinearPolicy(np.zeros((3, 2)), np.zeros((3, 2, 4)), np.zeros((3, 4)), previous_gains=np.eye(2)),
-            ("previous_gains", "(3, 2, 2)", "(2, 2)"),
-        ),
-        (
-            lambda: vp.LinearPolicy(np.zeros((3, 2)), np.zeros((3, 2, 4)), np.zeros((3, 4)), previous=np.zeros((3, 2))),
-            ("previous", "previous_gains"),
-        ),
-        (
-            lambda: vp.LinearPolicy(np.zeros((3, 2)), np.zeros((3, 2, 4)), np.zeros((3, 4)), before=[0.0]),
-            ("before", "(2,)", "(1,)"),
-        ),
-        (lambda: random_policy(vp.Scene(sliders(2)), 4).control(4, np.zeros(4)), ("interval", "0", "3", "4")),
-    ],
-)
-def test_mistakes_are_named(make, facts):
-    with refused(vp.InputError, facts):
-        make()

@@ -36,7 +36,6 @@ Q0, V0 = np.array([path(0.0), 0.5, -0.4]), np.array([rate(0.0), 0.0, 0.0])
 
 
 def test_a_motion_under_a_function_of_time_is_linearized():
-    """Against differences in the position and the velocity at the end of the step, and in a force held over it."""
     scene = arm("cubic")
     begin = wanted(scene, 0.01)
 
@@ -79,7 +78,6 @@ def test_a_tolerance_follows_a_function_of_time():
 @pytest.mark.parametrize("linear", [False, True])
 @pytest.mark.parametrize("hold", [1, 3])
 def test_a_policy_moves_an_input_over_its_intervals(hold, linear):
-    """With feedback of the free joints on the position; rows of the record repeat the motion."""
     scene = arm("linear")
     dt, N = 0.01, 10
     t = hold * dt * np.arange(N + 1)
@@ -106,7 +104,7 @@ def test_a_policy_moves_an_input_over_its_intervals(hold, linear):
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
-def test_a_controller_takes_them(interpolation: str) -> None:
+def test_a_controller_takes_them(interpolation):
     problem = hand(interpolation, steps=12, dt=0.04)
     run = vp.Mpc(problem).run(vp.Plant(problem.scene, substeps=3), duration=1.2)
     np.testing.assert_allclose(run.motion.q[1:, 0], run.motion.u[:, 0], atol=1e-12)
@@ -115,8 +113,7 @@ def test_a_controller_takes_them(interpolation: str) -> None:
 
 @pytest.mark.parametrize("controls", ["held", "linear"])
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
-def test_searches_start_on_states(interpolation: str, controls: str) -> None:
-    """The inputs follow the states, forces of the other joints make up for what the motors lack: the same optimum."""
+def test_searches_start_on_states(interpolation, controls):
     problem = hand(interpolation, controls=controls)
     own = vp.solve(problem, tolerance=1e-12, check=False)
     share = np.linspace(0.0, 1.0, problem.steps + 1)[:, None]
@@ -130,8 +127,7 @@ def test_searches_start_on_states(interpolation: str, controls: str) -> None:
     np.testing.assert_allclose(first.trajectory.q[:, 0], own.trajectory.q[:, 0], atol=1e-12)
 
 
-def test_noise_of_the_position_of_an_input_is_differentiated_at_the_end_of_the_step() -> None:
-    """Its derivatives in the controls at both ends of a line, by differences of the fields there."""
+def test_noise_of_the_position_of_an_input_is_differentiated_at_the_end_of_the_step():
     own = vp.CustomNoise(
         lambda q, v, u: np.array([[0.0], [u[0] * u[1]], [u[0] ** 2]]),
         1,
@@ -141,7 +137,7 @@ def test_noise_of_the_position_of_an_input_is_differentiated_at_the_end_of_the_s
     problem = hand("linear", steps=1, noise=own)
     u, step = np.array([0.1, -0.2, 0.3, 0.5, 0.1, -0.3]), 1e-5
 
-    def linearized(ends: np.ndarray) -> vp.Linearization:
+    def linearized(ends):
         return vp.linearize(problem.scene, problem.simulate(lines(problem, ends.reshape(2, 3))))
 
     lin = linearized(u)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from findings import about
 from mechanisms import crank_and_slider, slider
+from oracles import slope
 from refusals import naming
 from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
@@ -14,7 +15,6 @@ HELD = [vp.Midpoint(kick="held"), vp.Gauss(2, kick="held"), vp.Radau(2, kick="he
 
 
 def oscillator(damping):
-    """Two coupled links on springs, with noise."""
     return vp.Scene(vp.planar_chain(2), gravity=False, damping=damping, stiffness=20.0, noise=vp.AdditiveNoise(0.3))
 
 
@@ -27,7 +27,6 @@ def continuous(scene):
 
 
 def at_rest(scene, integrator, dt, steps=1):
-    """The linearization of steps at rest at zero."""
     still = {"q0": np.zeros(2), "v0": np.zeros(2), "increments": 0}
     return vp.linearize(scene, vp.simulate(scene, **still, dt=dt, steps=steps, integrator=integrator, check=False))
 
@@ -35,7 +34,6 @@ def at_rest(scene, integrator, dt, steps=1):
 @pytest.mark.parametrize("damping", [0.5, 30.0])
 @pytest.mark.parametrize("dt", [1e-2, 0.1, 1.0])
 def test_the_stationary_covariance_of_the_midpoint_rule_is_exact(damping, dt):
-    """At every step; that of impulses before the steps is not."""
     scene = oscillator(damping)
     A, rate = continuous(scene)
     exact = solve_continuous_lyapunov(A, -rate)
@@ -51,7 +49,6 @@ def test_the_stationary_covariance_of_the_midpoint_rule_is_exact(damping, dt):
 @pytest.mark.parametrize("kind", [vp.Midpoint, vp.Gauss, vp.Radau])
 @pytest.mark.parametrize("guard", [None, vp.Guard(branch_margin=0.9, energy_balance=1e-6)], ids=["whole", "divided"])
 def test_the_force_acts_like_a_control_of_the_step(kind, guard, servo):
-    """The motion of a control F dw / dt, energies included, also in steps that the guard divides."""
     robot = vp.planar_chain(2)
     integrator = kind(guard=guard, kick="held")
     start = {"q0": [1.0, 0.5], "v0": [2.0, -9.0], "dt": 0.1, "steps": 8, "integrator": integrator, "check": False}
@@ -104,7 +101,6 @@ def test_a_damped_velocity_has_its_stationary_deviation_or_a_warning(integrator,
      ([0, 0, 0], [1, 1, 1], None, False), ([0, 0, 1e3], [0, 0, 1], None, True), ([0, 0, 1e3], [1] * 3, "block", False)],
 )  # fmt: skip
 def test_only_damped_joints_that_noise_moves_have_wrong_deviations(damping, noise, held, told):
-    """A damper without noise, noise without a damper, and a joint that is moved by hand are right."""
     inputs = vp.KinematicInput(held) if held else ()
     scene = vp.Scene(
         crank_and_slider(), gravity=False, damping=damping, constraints=inputs, noise=vp.AdditiveNoise(noise)
@@ -118,7 +114,6 @@ SERVO = (40.0, 3.0)
 
 
 def servoed(limit, **more):
-    """A chain of two links, the first of which a servo with a limit drives."""
     servo = vp.PositionServo(*({"joint1": value} for value in (*SERVO, limit)))
     return vp.Scene(vp.planar_chain(2), damping=0.1, forces=[servo], noise=vp.AdditiveNoise([0.3, 0.2]), **more)
 
@@ -139,7 +134,6 @@ def test_drives_at_their_limits_do_not_cut_noise_off(kick):
 @pytest.mark.parametrize("command", [0.2, 0.45, 0.9], ids=["free", "bent", "saturated"])
 @pytest.mark.parametrize("constraints", [(), [vp.JointTie("joint2", "joint1")]], ids=["single", "tied"])
 def test_derivatives_beside_a_limited_drive(integrator, command, constraints):
-    """Those in the noise and in the control, by differences of steps, below, around and beyond the servo's limit."""
     if constraints and isinstance(integrator, vp.Radau):
         pytest.skip("Radau's methods keep no constraints")
     scene, n = servoed(10.0, constraints=constraints), 2
@@ -152,11 +146,9 @@ def test_derivatives_beside_a_limited_drive(integrator, command, constraints):
         return np.concatenate([motion.q[-1], motion.p[-1]])
 
     lin = vp.linearize(scene, vp.simulate(scene, q, v, controls=u[None], increments=0, **options))
-    step, none = 1e-4, np.zeros(n)
-    by_noise = [(end(none, step * e) - end(none, -step * e)) / (2.0 * step) for e in np.eye(n)]
-    by_control = [(end(step * e, none) - end(-step * e, none)) / (2.0 * step) for e in np.eye(n)]
-    for own, differences in ((lin.G[0], by_noise), (lin.B[0], by_control)):
-        expected = np.stack(differences, axis=1)
+    none = np.zeros(n)
+    for own, moved in ((lin.G[0], lambda z: end(none, z)), (lin.B[0], lambda z: end(z, none))):
+        expected = np.transpose([slope(moved, none, e, 1e-4) for e in np.eye(n)])
         np.testing.assert_allclose(own, expected, rtol=0, atol=2e-7 * np.abs(expected).max())
     assert np.abs(lin.G[0, n:, 0]).max() > 0.05
     # The demand at the start is 0, 0.97 and 2.77 times the limit.

@@ -29,7 +29,6 @@ def beside_a_limit(noise, **options):
 
 
 def arm(name, begin, travel, noise):
-    """A reach whose goal is a little beyond limits with a margin."""
     robot, begin = vp.load_robot(name, lock={"panda": {"panda_finger_joint1": 0.02}}.get(name)), np.array(begin)
     goal, scene = begin + travel, vp.Scene(robot, damping=0.5, noise=noise)
     cost = vp.ControlCost(1e-3, scene.holding_torque(begin)) + vp.TrackingCost(goal, 10.0)

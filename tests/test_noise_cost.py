@@ -1,50 +1,17 @@
 """What noise costs a plan: exact values, paths, fine steps, its effect along lines, and the warning of long steps."""
 
+import dataclasses
+
 import numpy as np
-import pinocchio as pin
 import pytest
 from findings import about
 from oracles import lines
 from plan_problems import linear
-from scipy.linalg import expm
 
 import varpin as vp
 from varpin.control.noise import left_within_steps, noise_cost
 from varpin.control.stages import Feedback, Steps
 from varpin.integrators.base import diffusion_and_drift
-
-LEVEL, DAMPING = 0.3, 1.5
-WEIGHTS = {"q": 5.0, "v": 1.0, "u": 0.05}
-
-
-def plan(dt: float, **options: object) -> vp.Solution:
-    """One joint without gravity, held at rest: the noise cost is the whole cost."""
-    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=DAMPING, noise=vp.AdditiveNoise(LEVEL))
-    cost = vp.TrackingCost([0.0], WEIGHTS["q"]) + vp.VelocityCost(WEIGHTS["v"]) + vp.ControlCost(WEIGHTS["u"])
-    cost += vp.Terminal(vp.VelocityCost(0.1))
-    return vp.solve(vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=dt, steps=round(1.0 / dt), **options))
-
-
-def exact(solution: vp.Solution) -> float:
-    """E[cost] from the moments of (q, v, u), whose equations are linear, by the matrix exponential."""
-    model = solution.problem.scene.robot.model
-    inertia = pin.crba(model, model.createData(), pin.neutral(model))[0, 0]
-    A = np.array([[0.0, 1.0, 0.0], [0.0, -DAMPING / inertia, 1.0 / inertia], [0.0, 0.0, 0.0]])
-    kick = np.diag([0.0, (LEVEL / inertia) ** 2, 0.0])
-    rates = np.zeros((11, 11))
-    rates[:9, :9] = np.kron(A, np.eye(3)) + np.kron(np.eye(3), A)
-    rates[:9, 10] = kick.ravel()
-    rates[9, :9] = np.diag(list(WEIGHTS.values())).ravel()
-    interval = expm(rates * solution.problem.dt * solution.problem.hold)
-    S, total = np.zeros((3, 3)), 0.0
-    for gain in solution.gains[:, 0]:
-        decide = np.eye(3)
-        decide[2] = gain[0], gain[1] * inertia, 0.0
-        S = decide @ S @ decide.T
-        end = interval @ np.concatenate([S.ravel(), [0.0, 1.0]])
-        S, total = end[:9].reshape(3, 3), total + end[9]
-    return total + 0.1 * S[1, 1]
-
 
 CONTROL, STATE = vp.ControlNoise(0.3), vp.StateNoise(3.0, center=np.zeros(2))
 SLIDING = vp.CustomNoise(
@@ -55,8 +22,7 @@ SLIDING = vp.CustomNoise(
 )
 
 
-def reach(noise: vp.Noise, **options: object) -> vp.OptimalControlProblem:
-    """A reach of two links that costs more than little by its noise."""
+def reach(noise, **options):
     cost = vp.ControlCost(0.05) + vp.VelocityCost(0.1)
     cost += vp.Terminal(vp.TrackingCost([0.5, -0.5], 20.0) + vp.VelocityCost(5.0))
     scene = vp.Scene(vp.planar_chain(2), damping=0.2, noise=noise)
@@ -64,7 +30,7 @@ def reach(noise: vp.Noise, **options: object) -> vp.OptimalControlProblem:
     return vp.OptimalControlProblem(scene, cost, np.full(2, 0.2), np.zeros(2), **given)
 
 
-def of(solution: vp.Solution) -> tuple[Steps, Feedback]:
+def of(solution):
     return Steps(solution.problem, solution.trajectory), Feedback(solution.gains, solution.previous_gains)
 
 
@@ -79,12 +45,12 @@ def of(solution: vp.Solution) -> tuple[Steps, Feedback]:
     ],
     ids=["held", "explicit", "changes of controls", "linear", "linear, changes of controls"],
 )
-def test_it_is_that_of_each_impulse(more: vp.Cost | None, options: dict[str, object]) -> None:
+def test_it_is_that_of_each_impulse(more, options):
     """Of a linear system the cost is quadratic in the increments: their second differences are its mean under noise."""
     plan = vp.solve(linear(more, noise=vp.AdditiveNoise(0.3), **options), check=False)
     problem, expected = plan.problem, 0.0
 
-    def cost(w: np.ndarray) -> float:
+    def cost(w):
         return problem.cost_of(problem.simulate(plan.policy, increments=w.reshape(problem.steps, 2)))
 
     least = cost(np.zeros(2 * problem.steps))
@@ -96,8 +62,7 @@ def test_it_is_that_of_each_impulse(more: vp.Cost | None, options: dict[str, obj
 @pytest.mark.parametrize("noise", [vp.AdditiveNoise(0.3), CONTROL + STATE, SLIDING], ids=["white", "core", "python"])
 @pytest.mark.parametrize("kick", ["left", "split", "held"])
 @pytest.mark.parametrize("options", [{"hold": 2}, {"controls": "linear"}], ids=["held", "linear"])
-def test_forward_and_backward_it_is_the_same(options: dict[str, object], kick: str, noise: vp.Noise) -> None:
-    """By covariances and by the value function, about a motion that is not the best."""
+def test_forward_and_backward_it_is_the_same(options, kick, noise):
     problem = reach(noise, integrator=vp.Gauss(2, kick=kick), steps=6, **options)
     u = np.random.default_rng(1).normal(size=(problem.decisions, 2))
     plan = vp.solve(problem, u, max_iterations=0, check=False)
@@ -105,7 +70,7 @@ def test_forward_and_backward_it_is_the_same(options: dict[str, object], kick: s
 
 
 @pytest.mark.parametrize("integrator", [vp.Gauss(2, kick="held"), vp.RungeKutta4()], ids=["core", "python"])
-def test_paths_cost_what_the_plan_expects(integrator: vp.Integrator) -> None:
+def test_paths_cost_what_the_plan_expects(integrator):
     """Path by path, with what no path shows; on average the table of plans has it."""
     plan = vp.solve(reach(SLIDING, integrator=integrator, controls="linear"), check=False)
     again = [
@@ -117,25 +82,29 @@ def test_paths_cost_what_the_plan_expects(integrator: vp.Integrator) -> None:
     assert plan.monte_carlo(2, rng=0).cost == pytest.approx(np.mean(again) + within, rel=1e-12)
 
 
-def test_costs_of_velocities_are_close_in_long_steps_too():
-    """Of the default, without and with control noise; monte_carlo has the same share within steps."""
-    long = plan(0.1)
-    assert long.noise_cost == pytest.approx(exact(long), rel=0.05)
-    assert not about(long.warnings, "noise within steps")
-    estimate = long.monte_carlo(400, rng=0)
-    assert abs(estimate.cost - estimate.predicted) < 4.0 * estimate.standard_error
+def in_parts(plan, parts=16):
+    problem, held = plan.problem, np.repeat(plan.trajectory.u, parts, axis=0)
+    fine = problem.at(dt=problem.dt / parts, hold=parts * problem.hold)
+    return noise_cost(Steps(fine, fine.simulate(held)), of(plan)[1])
 
 
-def test_a_plan_whose_steps_are_long_for_the_noise_says_so():
-    """With the paper's impulse."""
-    long = plan(0.1, integrator=vp.Gauss(4))
-    assert abs(long.noise_cost / exact(long) - 1.0) > 0.15
-    (sentence,) = about(long.warnings, "noise within steps")
-    halves = float(sentence.split()[2])
-    assert abs(halves - exact(long)) < 0.6 * abs(long.noise_cost - exact(long))
-    assert "problem.at(dt=0.05, hold=2) is closer" in sentence
-    # Whether paths agree with the linear model is not known without them.
-    assert "agrees" not in sentence
+@pytest.mark.parametrize("integrator", [None, vp.Gauss(4)], ids=["default", "impulses"])
+def test_long_steps(integrator):
+    """Costs of velocities are close; of an impulse before each step, the paper's, a warning says what is closer."""
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=1.5, noise=vp.AdditiveNoise(0.3))
+    cost = vp.TrackingCost([0.0], 5.0) + vp.VelocityCost(1.0) + vp.ControlCost(0.05)
+    cost += vp.Terminal(vp.VelocityCost(0.1))
+    plan = vp.solve(vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=0.1, steps=10, integrator=integrator))
+    exact, told = in_parts(plan), about(plan.warnings, "noise within steps")
+    assert bool(told) == (integrator is not None)
+    if not told:
+        assert plan.noise_cost == pytest.approx(exact, rel=0.05)
+        estimate = plan.monte_carlo(400, rng=0)
+        assert abs(estimate.cost - estimate.predicted) < 4.0 * estimate.standard_error
+        return
+    assert abs(plan.noise_cost / exact - 1.0) > 0.15
+    assert abs(float(told[0].split()[2]) - exact) < 0.6 * abs(plan.noise_cost - exact)
+    assert "problem.at(dt=0.05, hold=2) is closer" in told[0]
 
 
 @pytest.mark.parametrize(("strength", "told"), [(5e-4, True), (5e-5, False)])
@@ -159,7 +128,6 @@ def test_feedback_as_fast_as_the_steps_is_told_of_where_noise_matters(strength, 
 
 
 def test_steps_in_which_noise_grows_without_bound_have_no_cost(recwarn):
-    """As those of a force that drives: no warning of NumPy, and an error that rejects the trial."""
     cost = vp.VelocityCost(1.0) + vp.ControlCost(1.0)
 
     def problem(*forces):
@@ -188,12 +156,9 @@ def test_in_fast_motions_of_arms_it_is_that_of_fine_steps(damping):
         scene = vp.Scene(robot, damping=damping, noise=noise)
         return vp.OptimalControlProblem(scene, cost, begin, np.zeros(7), dt=0.05, steps=12)
 
-    plan = vp.solve(problem(None), check=False)
-    noisy, feedback = problem(vp.ControlNoise(0.05)), Feedback(plan.gains, plan.previous_gains)
-    fine = noisy.at(dt=0.05 / 16, hold=16)
-    there = noise_cost(Steps(fine, fine.simulate(np.repeat(plan.controls, 16, axis=0))), feedback)
-    assert noisy.integrator.kick == "held"
-    assert noise_cost(Steps(noisy, plan.trajectory), feedback) == pytest.approx(there, rel=0.05)
+    plan = dataclasses.replace(vp.solve(problem(None), check=False), problem=problem(vp.ControlNoise(0.05)))
+    assert plan.problem.integrator.kick == "held"
+    assert noise_cost(*of(plan)) == pytest.approx(in_parts(plan), rel=0.05)
 
 
 @pytest.mark.parametrize("integrator", [None, vp.Gauss(2, kick="held"), vp.Radau(3, kick="held")])
@@ -218,8 +183,7 @@ def test_what_velocities_cost_in_a_step_from_rest(damping, integrator):
 
 @pytest.mark.parametrize("noise", [CONTROL + STATE, SLIDING], ids=["core", "python"])
 @pytest.mark.parametrize("kick", ["left", "split", "held"])
-def test_the_effect_of_noise_along_a_line(noise: object, kick: str) -> None:
-    """Its derivatives in the controls at both ends, by differences of the fields before and after a quiet step."""
+def test_the_effect_of_noise_along_a_line(noise, kick):
     integrator = vp.Gauss(2, kick=kick)
     problem = reach(noise, steps=1, integrator=integrator, controls="linear").at(q0=[0.3, -0.2], v0=[0.4, 0.7])
     scene, n, left = problem.scene, 2, integrator.left
@@ -227,13 +191,13 @@ def test_the_effect_of_noise_along_a_line(noise: object, kick: str) -> None:
     motion = problem.simulate(lines(problem, at.reshape(2, 2)))
     lin = vp.linearize(scene, motion)
 
-    def effect(ends: np.ndarray) -> np.ndarray:
+    def effect(ends):
         moved = problem.simulate(lines(problem, ends.reshape(2, 2)))
 
-        def fields(k: int, u: np.ndarray) -> np.ndarray:
+        def fields(k, u):
             return scene.noise.fields(moved.q[k, None], moved.v[k, None], u[None], problem.q0).F[0]
 
-        def columns(k: int) -> np.ndarray:
+        def columns(k):
             slope = (fields(k, ends[2:]) - fields(k, ends[:2])) / np.sqrt(12.0)
             # Noise of the state's alone sees no slope.
             return np.hstack([fields(k, 0.5 * (ends[:2] + ends[2:])), slope[:, np.abs(slope).any(axis=0)]])
@@ -250,7 +214,7 @@ def test_the_effect_of_noise_along_a_line(noise: object, kick: str) -> None:
         np.testing.assert_allclose(derivatives[:, :, c], found, atol=1e-8)
 
 
-def test_strong_noise_costs_what_the_plan_expects_in_fine_steps() -> None:
+def test_strong_noise_costs_what_the_plan_expects_in_fine_steps():
     """The noise of a line is that of its controls within the step, so alternating ones do not escape it."""
     problem = reach(vp.ControlNoise(1.0), steps=10, controls="linear")
     plan = vp.solve(problem)
@@ -269,7 +233,7 @@ def test_strong_noise_costs_what_the_plan_expects_in_fine_steps() -> None:
 @pytest.mark.parametrize(
     ("kick", "constrained"), [("left", False), ("split", False), ("held", False), ("left", True), ("held", True)]
 )
-def test_paths_on_lines_are_repeated_and_examined_with_their_noise(kick: str, constrained: bool) -> None:
+def test_paths_on_lines_are_repeated_and_examined_with_their_noise(kick, constrained):
     noise = vp.ControlNoise(0.05) + vp.AdditiveNoise(0.01)
     limits = [vp.JointTie("joint2", "joint1")] if constrained else []
     scene = vp.Scene(vp.planar_chain(2), damping=0.2, noise=noise, constraints=limits)
@@ -290,8 +254,7 @@ def test_paths_on_lines_are_repeated_and_examined_with_their_noise(kick: str, co
 
 
 @pytest.mark.parametrize("integrator", [vp.Gauss(2), vp.Gauss(2, kick="held"), vp.RungeKutta4()], ids=str)
-def test_the_drift_along_a_line_is_its_mean_over_the_step(integrator: vp.Integrator) -> None:
-    """By Simpson's rule, exact for noise linear in the control; its derivatives by differences of quiet steps."""
+def test_the_drift_along_a_line_is_its_mean_over_the_step(integrator):
     sliding = vp.CustomNoise(
         lambda q, v, u: np.array([[0.2 * v[0] + 0.1 * u[1]], [0.3 + 0.1 * u[0] * v[1]]]),
         1,
@@ -302,12 +265,12 @@ def test_the_drift_along_a_line_is_its_mean_over_the_step(integrator: vp.Integra
     problem = reach(sliding, steps=1, integrator=integrator, controls="linear").at(q0=[0.3, -0.2], v0=[0.4, 0.7])
     scene, u = problem.scene, np.array([1.0, -2.0, -3.0, 4.0])
 
-    def ends(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def ends(x, u):
         at = problem.at(q0=x[:2], v0=x[2:])
         motion = at.simulate(lines(at, u.reshape(2, 2)))
         return np.concatenate([motion.q[1], motion.p[1] if integrator.variational else motion.v[1]])
 
-    def local(control: np.ndarray) -> np.ndarray:
+    def local(control):
         return diffusion_and_drift(scene, problem.q0, problem.v0, control, problem.q0)[1]
 
     mean = 0.5 * (u[:2] + u[2:])

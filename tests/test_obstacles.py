@@ -48,7 +48,6 @@ def apart(points, segment):
 
 
 def test_eight_points_are_a_box():
-    """Clear of it and inside; placed by its points, or by position and rotation; with slopes and on the move."""
     robot = vp.load_robot("ur5")
     center, sides = np.array([0.4, 0.2, 0.4]), np.array([0.3, 0.2, 0.5])
 
@@ -99,7 +98,6 @@ def test_distances_are_those_of_least_squares(points, radius):
 
 
 def test_slopes_are_differences():
-    """Of capsules against each kind of obstacle and each other; capsules hold all of their links."""
     robot = vp.load_robot("ur5")
     made = [
         vp.Obstacle.sphere([0.4, 0.2, 0.5], 0.15),
@@ -139,7 +137,6 @@ def test_what_is_no_hull_is_refused(given, facts):
 
 
 def test_drawn_where_it_is(tmp_path):
-    """Its corners in the world, over its way, in the page, and its triangles closed and facing outwards."""
     hull = vp.Obstacle.convex(WEDGE, [0.5, 0.1, 0.2], TURN).moving(lambda t: [t, 0.0, 0.0])
     problem = reach(vp.KeepClear(TWO, [hull], capsules=CAPSULES))
     known = WEDGE @ TURN.T + [0.5, 0.1, 0.2]

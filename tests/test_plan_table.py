@@ -23,8 +23,7 @@ MET = 1e-6
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_plan(name: str) -> None:
-    """It converges to the least cost known, and holds to its constraints, by rows that are not the library's."""
+def test_plan(name):
     case = CASES[name]
     problem, plan = case.problem, case.plan
     assert plan.status is vp.Status.CONVERGED, plan.reason
@@ -40,12 +39,12 @@ def test_plan(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name, case in SMALL.items() if case.kkt])
-def test_karush_kuhn_tucker(name: str) -> None:
+def test_karush_kuhn_tucker(name):
     assert kkt(SMALL[name].plan) <= SMALL[name].kkt
 
 
 @pytest.mark.parametrize("name", [name for name, case in SMALL.items() if case.scipy])
-def test_scipy_finds_no_less(name: str) -> None:
+def test_scipy_finds_no_less(name):
     case = SMALL[name]
     u = case.plan.controls
     disturbed = u * (1.0 + 0.02 * np.random.default_rng(0).normal(size=u.shape))
@@ -53,7 +52,7 @@ def test_scipy_finds_no_less(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.within])
-def test_within_steps(name: str) -> None:
+def test_within_steps(name):
     """The constraints hold in sixteenths of the steps, too; arms fall over without feedback: each from its node."""
     case, worst = CASES[name], 0.0
     problem, plan, motion = case.problem, case.plan, case.plan.trajectory
@@ -71,8 +70,7 @@ def test_within_steps(name: str) -> None:
 @pytest.mark.parametrize(
     "name", ["held, speeds", "held, out of a sphere", "linear, rates and goal", "held over 3 steps"]
 )
-def test_multipliers_are_slopes_of_the_least_cost(name: str) -> None:
-    """Of the first constraint's bound: how the least cost falls as it is relaxed."""
+def test_multipliers_are_slopes_of_the_least_cost(name):
     change = 1e-3
     relaxed = {
         "held, speeds": lambda d: reach(speeds(1.8 + d)),
@@ -86,14 +84,14 @@ def test_multipliers_are_slopes_of_the_least_cost(name: str) -> None:
     assert (less - more) / (2.0 * change) == pytest.approx(pull, rel=1e-3)
 
 
-def test_what_no_motion_meets_changes_nothing() -> None:
+def test_what_no_motion_meets_changes_nothing():
     wide = vp.KeepInBox(TWO, "tip", [-5.0] * 3, [5.0] * 3)
     within = vp.solve(reach(speeds(50.0), wide, control_limits=(-200.0, 200.0)), check=False)
     assert within.cost == pytest.approx(SMALL["held"].plan.cost, rel=1e-6)
     assert not any(report.active.any() for report in within.constraints)
 
 
-def test_the_optimum_of_a_double_integrator_is_the_continuous_one() -> None:
+def test_the_optimum_of_a_double_integrator_is_the_continuous_one():
     """Least effort from rest to rest is linear in time: two intervals hold it exactly."""
     robot = vp.planar_chain(1)
     scene = vp.Scene(robot, gravity=False)
@@ -119,7 +117,7 @@ def test_the_optimum_of_a_double_integrator_is_the_continuous_one() -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in SMALL | ARMS if not name.startswith(("closed loop", "an input"))])
-def test_feedback_holds_a_disturbed_start(name: str) -> None:
+def test_feedback_holds_a_disturbed_start(name):
     """From 0.02 rad beside the start no joint goes farther off than five times that, and none is so at the end."""
     problem, plan = CASES[name].problem, CASES[name].plan
     away = 0.02 * np.random.default_rng(0).choice([-1, 1], problem.scene.robot.dof)
@@ -147,7 +145,7 @@ FED_BACK = {
 
 
 @pytest.mark.parametrize("name", FED_BACK)
-def test_feedback_is_the_optimum_from_another_start(name: str) -> None:
+def test_feedback_is_the_optimum_from_another_start(name):
     problem, away = FED_BACK[name](), np.array([0.3, -0.2])
     plan = vp.solve(problem, tolerance=1e-14, check=False)
     assert plan.status.converged
@@ -163,7 +161,7 @@ def test_feedback_is_the_optimum_from_another_start(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in SMALL if name.startswith("noise")])
-def test_noise_costs_what_motions_under_noise_cost(name: str) -> None:
+def test_noise_costs_what_motions_under_noise_cost(name):
     plan = SMALL[name].plan
     found = plan.monte_carlo(4000, rng=0)
     assert plan.noise_cost > 0.1 * plan.cost
@@ -174,11 +172,11 @@ def test_noise_costs_what_motions_under_noise_cost(name: str) -> None:
 # --- what cannot be --------------------------------------------------------------------------------------------------
 
 
-def joints(low: object, high: object) -> vp.PlanConstraint:
+def joints(low, high):
     return vp.WithinJointLimits(TWO, (low, high))
 
 
-def clear(place: list[float], radius: float) -> vp.PlanConstraint:
+def clear(place, radius):
     return vp.KeepClear(TWO, [vp.Obstacle.sphere(place, radius)], 0.02, capsules=CAPSULES)
 
 
@@ -203,7 +201,7 @@ IMPOSSIBLE = {
 
 
 @pytest.mark.parametrize("name", IMPOSSIBLE)
-def test_what_cannot_be_is_infeasible_and_named(name: str) -> None:
+def test_what_cannot_be_is_infeasible_and_named(name):
     """The reason has a constraint, one of its rows, a node and an amount, all of which are so of the plan's motion."""
     constraints, options, most = IMPOSSIBLE[name]
     given = {"q0": REST, "v0": REST, "dt": 0.05, "steps": 20, "constraints": constraints, **options}
@@ -223,20 +221,20 @@ def test_what_cannot_be_is_infeasible_and_named(name: str) -> None:
     assert report.excess[place].max() >= 0.99 * amount
 
 
-def test_what_is_infeasible_from_given_controls_may_not_be_so_from_others() -> None:
+def test_what_is_infeasible_from_given_controls_may_not_be_so_from_others():
     goals = [vp.ReachFrame(TWO, "tip", position=[1.5, 0.0, z]) for z in (-0.5, 0.9)]
     assert "without controls=" in vp.solve(reach(*goals), np.zeros(2), check=False).reason
     assert "controls=" not in vp.solve(reach(*goals), check=False).reason
 
 
 @pytest.mark.parametrize("name", ["held, goal", "held, speeds"])
-def test_regularization_makes_nothing_infeasible(name: str) -> None:
+def test_regularization_makes_nothing_infeasible(name):
     plan = vp.solve(SMALL[name].problem, check=False, regularization=1e6)
     assert plan.status is vp.Status.CONVERGED
     assert plan.cost <= (1.0 + ABOVE) * SMALL[name].cost
 
 
-def test_a_start_outside_that_one_step_mends_is_no_reason_to_end() -> None:
+def test_a_start_outside_that_one_step_mends_is_no_reason_to_end():
     mends = vp.WithinJointLimits(TWO, ([0.05, -1], [2.0, 1]))
     for options in ({}, {"control_limits": (-2000.0, 2000.0)}, {"controls": "linear", "between_nodes": True}):
         plan = vp.solve(reach(mends, **options), check=False)
@@ -251,7 +249,7 @@ RESUMED += ["noise of the controls", "noise of the controls, linear"]
 
 
 @pytest.mark.parametrize("name", RESUMED)
-def test_a_plan_that_is_cut_saved_and_resumed_is_the_same_to_the_bit(name: str, tmp_path) -> None:
+def test_a_plan_that_is_cut_saved_and_resumed_is_the_same_to_the_bit(name, tmp_path):
     case = SMALL[name]
     for most in (1, 3):
         part = vp.solve(case.problem, max_iterations=most, check=False)
@@ -264,7 +262,7 @@ def test_a_plan_that_is_cut_saved_and_resumed_is_the_same_to_the_bit(name: str, 
         assert rest.cost == case.plan.cost
 
 
-def test_a_file_holds_the_whole_plan(tmp_path) -> None:
+def test_a_file_holds_the_whole_plan(tmp_path):
     plan = SMALL["held, goal and rates"].plan
     known = vp.Solution.load(plan.save(tmp_path / "plan.npz"), plan.problem)
     for one, other in zip(plan.constraints, known.constraints, strict=True):
@@ -277,11 +275,10 @@ def test_a_file_holds_the_whole_plan(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("name", RESUMED)
-def test_interrupted(name: str) -> None:
-    """The best motion so far, from which the search goes on."""
+def test_interrupted(name):
     case, seen = SMALL[name], []
 
-    def stop(iteration: vp.Iteration) -> None:
+    def stop(iteration):
         seen.append(iteration)
         if len(seen) == 2:
             raise KeyboardInterrupt
@@ -296,7 +293,7 @@ def test_interrupted(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", RESUMED)
-def test_the_time_limit_ends_a_search(name: str) -> None:
+def test_the_time_limit_ends_a_search(name):
     case = SMALL[name]
     none = vp.solve(case.problem, check=False, time_limit=1e-9)
     assert none.status is vp.Status.OUT_OF_TIME
@@ -307,8 +304,7 @@ def test_the_time_limit_ends_a_search(name: str) -> None:
     assert vp.solve(case.problem, resume=some, check=False).cost == pytest.approx(case.plan.cost, rel=1e-6)
 
 
-def test_reports_of_each_iteration() -> None:
-    """To callbacks of one and of two arguments, and to ``progress``; they are those of the plan's history."""
+def test_reports_of_each_iteration():
     case = SMALL["held, speeds"]
     rows, motions, counts = [], [], []
     plan = vp.solve(case.problem, check=False, callback=rows.append, progress=lambda *count: counts.append(count))
@@ -324,7 +320,7 @@ def test_reports_of_each_iteration() -> None:
     assert plan.reason in plan.table()
 
 
-def test_repeated_searches_are_the_same_to_the_bit() -> None:
+def test_repeated_searches_are_the_same_to_the_bit():
     case = SMALL["held, speeds and torques"]
     np.testing.assert_array_equal(vp.solve(case.problem, check=False).controls, case.plan.controls)
 
@@ -339,8 +335,7 @@ def test_repeated_searches_are_the_same_to_the_bit() -> None:
         ("held, goal", False),
     ],
 )
-def test_any_start_leads_to_a_plan(name: str, alone: bool) -> None:
-    """Zero controls, a constant, a plan, a policy, and states that no controls follow; to one minimum if ``alone``."""
+def test_any_start_leads_to_a_plan(name, alone):
     case = SMALL[name]
     starts = {
         "zero": {"controls": np.zeros(2)},
@@ -362,7 +357,7 @@ def test_any_start_leads_to_a_plan(name: str, alone: bool) -> None:
 
 
 @pytest.mark.parametrize("controls", ["held", "linear"])
-def test_a_controller_within_limits_and_constraints(controls: str) -> None:
+def test_a_controller_within_limits_and_constraints(controls):
     problem = swing(speeds(1.0), controls=controls, control_limits=([-20.0, -6.0], [20.0, 6.0]))
     run = vp.Mpc(problem).run(duration=0.9)
     assert not run.failed.any()
@@ -377,7 +372,6 @@ def test_a_controller_within_limits_and_constraints(controls: str) -> None:
 
 
 def test_torques_of_a_loop_with_a_limit_of_the_rate_do_not_jump():
-    """From tick to tick the lines join, and the plant's torque changes no faster than allowed, noise or not."""
     scene = vp.Scene(TWO, damping=0.1)
     hold = scene.holding_torque([0.1, 0.2])
     cost = vp.TrackingCost([0.4, 0.0], 1e2) + vp.VelocityCost(1.0) + vp.ControlCost(1e-3)
@@ -397,16 +391,15 @@ def test_torques_of_a_loop_with_a_limit_of_the_rate_do_not_jump():
     np.testing.assert_allclose(ends[1:, 0], ends[:-1, 1], atol=1e-4)
 
 
-def test_failed_ticks() -> None:
-    """A noise that cannot be had in two ticks of ten: the plan before acts on, and a warning says so."""
+def test_failed_ticks():
     tick = 0
 
-    def field(q, v, u) -> np.ndarray:
+    def field(q, v, u):
         if tick in (3, 4):
             raise ValueError("no such noise")
         return 1e-3 * np.eye(2)
 
-    def count(done: int, _: int) -> None:
+    def count(done, _):
         nonlocal tick
         tick = done
 

@@ -29,7 +29,6 @@ def run(given, dt, steps, **options):
 
 @pytest.mark.parametrize("finer", [1, 2, 7])
 def test_a_policy_with_a_period_is_held_over_finer_steps(finer):
-    """By hand: each control from the state that its period begins with, in an open loop."""
     given, dt = policy(), PERIOD / finer
     motion = run(given, dt, INTERVALS * finer)
     np.testing.assert_array_equal(np.ptp(motion.u.reshape(INTERVALS, finer, 2), axis=1), 0.0)
@@ -143,7 +142,6 @@ def test_a_law_is_called_once_where_each_period_begins(integrator):
 
 
 def test_noise_that_python_evaluates_keeps_the_period():
-    """Such noise is simulated step by step."""
     motions = []
     for noise in (vp.CustomNoise(lambda q, v, u: np.eye(2) * 0.1, 2), vp.AdditiveNoise(0.1)):
         given = {"dt": 1e-2, "steps": 17, "controls": lambda t, q, v: -10.0 * q - v, "period": 5, "rng": 3}

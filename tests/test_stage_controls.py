@@ -35,7 +35,6 @@ def test_one_stage_holds_the_mean(arm, integrator):
 
 @pytest.mark.parametrize("integrator", [vp.Gauss(3), vp.Radau(2), vp.RungeKutta4()], ids=str)
 def test_values_and_means(arm, integrator):
-    """u_stages are of the polynomial with the function's own moments, one a stage, and u is its mean."""
     motion = vp.simulate(arm, Q0, np.zeros(6), dt=0.01, steps=6, controls=vp.OpenLoop(force), integrator=integrator)
     times = 2.0 * np.array(integrator.stage_times) - 1.0
     for k in range(6):
@@ -48,7 +47,6 @@ def test_values_and_means(arm, integrator):
 
 
 def stiff_scene():
-    """Friction and a servo, whose forces depend on the controls', on a chain."""
     robot = vp.planar_chain(3)
     names = robot.joint_names
     return vp.Scene(
@@ -71,7 +69,6 @@ def push(t):
 
 @pytest.mark.parametrize(("stages", "balance"), [(2, 1e-3), (3, 1e-7)])
 def test_derivatives_of_steps_in_parts_against_differences(stages, balance):
-    """In the state, in a shift of the control and in a ramp of it."""
     scene, integrator = stiff_scene(), vp.Gauss(stages, guard=vp.Guard(energy_balance=balance))
     n, dt = 3, SMALL["dt"]
     motion = vp.simulate(scene, CHAIN_Q, CHAIN_V, controls=vp.OpenLoop(push), integrator=integrator, **SMALL)
@@ -109,32 +106,10 @@ def test_steps_in_parts_keep_the_order(stages, balance):
     assert np.log2(errors[0] / errors[1]) > 2 * stages - 0.5, errors
 
 
-def test_what_is_refused():
-    scene = stiff_scene()
-    with refused(vp.InputError, "node", "(3,)"):
-        vp.FirstOrderHold(np.zeros(3))
-    with refused(vp.InputError, "finite"):
-        vp.FirstOrderHold([[0.0], [np.nan]])
-    with refused(vp.InputError, "FirstOrderHold", "u", "(4, 3)", "(3, 3)"):
-        vp.simulate(scene, CHAIN_Q, CHAIN_V, controls=vp.FirstOrderHold(np.zeros((3, 3))), **SMALL)
-    calls = []
-
-    def breaks(t):
-        calls.append(t)
-        if t > 0.05:
-            raise RuntimeError("no more")
-        return push(t)
-
-    with refused(vp.ControlError, "1") as info:
-        vp.simulate(scene, CHAIN_Q, CHAIN_V, controls=vp.OpenLoop(breaks), integrator=vp.Gauss(2), **SMALL)
-    assert info.value.trajectory.steps == 1
-
-
 RISE = np.array([0.5, -0.2, 0.1])
 
 
 def rising(t):
-    """Torques (m,) of a time, or (K, m) of times."""
     t = np.asarray(t)[..., None]
     return RISE * (1.0 + 2.0 * t * t)
 
