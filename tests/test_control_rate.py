@@ -1,4 +1,4 @@
-"""The cost of changing controls: dense minima, a plain Riccati recursion, simulated noise, and what hands it on."""
+"""The cost of changing controls: values, feedback on the control before, and what hands it on."""
 
 import numpy as np
 import pytest

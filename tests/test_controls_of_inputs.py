@@ -1,4 +1,4 @@
-"""Controls of scenes with kinematic inputs: functions of time, lines and policies beside forces, and plans on lines."""
+"""Controls of scenes with kinematic inputs: functions of time, lines, policies, and plans on lines."""
 
 import numpy as np
 import pytest

@@ -70,7 +70,7 @@ def most_allowed():
 
 @pytest.mark.parametrize("name", BOUNDED)
 def test_margins_in_standard_deviations(name):
-    """At margin 2 each bound at each node is violated by at most 2.3 % of motions, and at an active one by many."""
+    """At margin 2 by at most 2.3 % of motions for each bound and node, at an active one by many."""
     problem = BOUNDED[name]()
     plan = vp.solve(problem, check=False)
     assert plan.status is vp.Status.CONVERGED, plan.reason
@@ -130,7 +130,7 @@ def test_margins_that_grow_with_the_motion_do_not_run_away(controls):
 
 
 def test_a_warning_of_a_small_margin_counts():
-    """Noise that Python evaluates leaves margins as they are; what is said of a bound is so by other motions."""
+    """Noise that Python evaluates leaves margins as they are."""
     coarse = {"dt": 0.1, "steps": 8}
     problem = under_a_lid(vp.CustomNoise(lambda q, v, u: 0.7 * np.eye(2), 2), **coarse)
     plan = vp.solve(problem)

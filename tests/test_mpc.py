@@ -1,4 +1,4 @@
-"""Model predictive control: its plans are those of solve, its decisions those of its plans, its times the plant's."""
+"""Model predictive control: plans are those of solve, decisions those of plans, times the plant's."""
 
 import numpy as np
 import pytest
@@ -298,7 +298,6 @@ SPEEDS = [vp.WithinVelocityLimits(TWO, (-0.8, 0.8))]
 
 
 def round_things(time, swinging):
-    """A sphere and a ball in the tool's way, that swing with the time or stand where they are at a time."""
     center = bob if swinging else bob(time)
     ball = vp.Obstacle.sphere(bob(0.0 if swinging else time), 0.2)
     ball = ball.moving(lambda t: bob(t) - np.array(bob(0.0))) if swinging else ball
@@ -322,7 +321,6 @@ def test_obstacles_are_where_they_are_at_each_time():
 
 
 def test_ticks_that_find_no_plan_are_told_of():
-    """A goal that no horizon reaches: multipliers stay bounded, and the goal is kept again once it can be."""
     far = vp.Mpc(bounded([vp.ReachFrame(TWO, "tip", position=[2.2, 0.0, 0.0])])).run(duration=0.3)
     assert far.infeasible.sum() > 3
     assert naming(far.warnings, "no plan", "ReachFrame('tip')")
@@ -355,7 +353,7 @@ def test_plans_of_ticks_are_saved_with_their_rows(tmp_path):
 
 
 def test_ticks_within_speeds_are_close_to_their_optimum():
-    """Of a UR3 most of whose joints are at their limits all the time, with one iteration a tick and with three."""
+    """Of a UR3 most of whose joints are at their limits all the time."""
     robot, begin = vp.load_robot("ur3"), np.array([0.0, -1.2, 1.2, -0.5, -1.0, 0.0])
     scene = vp.Scene(robot, damping=0.1)
     cost = vp.TrackingCost(lambda t: begin + 0.35 * np.sin(2.0 * t) * np.cos(np.arange(6)), 100.0)

@@ -1,4 +1,4 @@
-"""What noise costs a plan: exact values, paths, fine steps, its effect along lines, and the warning of long steps."""
+"""What noise costs a plan: exact values, paths, fine steps, lines, and the warning of long steps."""
 
 import dataclasses
 
@@ -46,7 +46,7 @@ def of(solution):
     ids=["held", "explicit", "changes of controls", "linear", "linear, changes of controls"],
 )
 def test_it_is_that_of_each_impulse(more, options):
-    """Of a linear system the cost is quadratic in the increments: their second differences are its mean under noise."""
+    """Of a linear system the cost is quadratic in the increments."""
     plan = vp.solve(linear(more, noise=vp.AdditiveNoise(0.3), **options), check=False)
     problem, expected = plan.problem, 0.0
 
@@ -90,7 +90,7 @@ def in_parts(plan, parts=16):
 
 @pytest.mark.parametrize("integrator", [None, vp.Gauss(4)], ids=["default", "impulses"])
 def test_long_steps(integrator):
-    """Costs of velocities are close; of an impulse before each step, the paper's, a warning says what is closer."""
+    """Of an impulse before each step, the paper's, a warning says what is closer."""
     scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=1.5, noise=vp.AdditiveNoise(0.3))
     cost = vp.TrackingCost([0.0], 5.0) + vp.VelocityCost(1.0) + vp.ControlCost(0.05)
     cost += vp.Terminal(vp.VelocityCost(0.1))
@@ -109,7 +109,6 @@ def test_long_steps(integrator):
 
 @pytest.mark.parametrize(("strength", "told"), [(5e-4, True), (5e-5, False)])
 def test_feedback_as_fast_as_the_steps_is_told_of_where_noise_matters(strength, told):
-    """The rest of the noise, beside its mean over a step, costs a fifth of it; a small part of the expected cost."""
     scene = vp.Scene(vp.load_robot("finger"), noise=vp.ControlNoise(strength))
 
     def reference(t):
@@ -149,7 +148,10 @@ def test_steps_in_which_noise_grows_without_bound_have_no_cost(recwarn):
 def test_in_fast_motions_of_arms_it_is_that_of_fine_steps(damping):
     """A Panda at 2.5 rad/s turns by 0.1 rad in a step: its inertias change, and with them momenta."""
     robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.02})
-    begin, goal = np.array([0.4, -0.3, 0.2, -1.2, 0.1, 1.0, 0.3]), np.array([0.9, 0.2, -0.3, -0.8, 0.6, 1.4, -0.1])
+    begin, goal = (
+        np.array([0.4, -0.3, 0.2, -1.2, 0.1, 1.0, 0.3]),
+        np.array([0.9, 0.2, -0.3, -0.8, 0.6, 1.4, -0.1]),
+    )
     cost = vp.ControlCost(1e-2) + vp.VelocityCost(1.0) + vp.Terminal(vp.TrackingCost(goal, 10.0))
 
     def problem(noise):
@@ -164,7 +166,7 @@ def test_in_fast_motions_of_arms_it_is_that_of_fine_steps(damping):
 @pytest.mark.parametrize("integrator", [None, vp.Gauss(2, kick="held"), vp.Radau(3, kick="held")])
 @pytest.mark.parametrize("damping", [0.0, 0.05, 1.5, 30.0])
 def test_what_velocities_cost_in_a_step_from_rest(damping, integrator):
-    """The exact variance of white noise over a step: its mean within the step, and at the end of the last one."""
+    """The exact variance of white noise, its mean over the step and at its end."""
     level, dt = 0.3, 0.1
     scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=damping, noise=vp.AdditiveNoise(level))
     inertia = vp.lagrangian_jet(scene, [0.0], [0.0]).Lvv[0, 0]
@@ -215,7 +217,7 @@ def test_the_effect_of_noise_along_a_line(noise, kick):
 
 
 def test_strong_noise_costs_what_the_plan_expects_in_fine_steps():
-    """The noise of a line is that of its controls within the step, so alternating ones do not escape it."""
+    """Controls that alternate do not escape it."""
     problem = reach(vp.ControlNoise(1.0), steps=10, controls="linear")
     plan = vp.solve(problem)
     assert plan.status is vp.Status.CONVERGED

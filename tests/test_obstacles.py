@@ -1,4 +1,4 @@
-"""Obstacles of plans: distances by least squares, hulls against boxes, slopes by differences, drawings, SRDF files."""
+"""Obstacles of plans: distances by least squares, slopes by differences, drawings, SRDF files."""
 
 import pickle
 from itertools import product
@@ -32,7 +32,7 @@ def drum(corners=64):
 
 
 def apart(points, segment):
-    """Distance of a hull to a segment: least squares with non-negative shares that sum to 1 on each side."""
+    """By least squares with non-negative shares that sum to 1 on each side."""
     heavy = 1e5
     ones, none = np.ones(len(points)), np.zeros(len(points))
     rows = np.vstack(

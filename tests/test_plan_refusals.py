@@ -1,4 +1,4 @@
-"""What problems, searches, plans, controllers and policies refuse, by the names of their arguments."""
+"""What problems, costs, searches, plans, controllers and policies refuse, by the names of their arguments."""
 
 import numpy as np
 import pytest
@@ -73,6 +73,25 @@ OF_PROBLEMS = [
     (lambda: linear(vp.ControlRateCost() + vp.ControlRateCost(1.0, BEFORE)), ("ControlRateCost", "before")),
     (lambda: linear().at(before=BEFORE), ("before", "ControlRateCost", "WithinControlRate")),
 ]
+OF_COSTS = [
+    (lambda: vp.TrackingCost(0.0, np.nan), ("TrackingCost", "weight", "nan")),
+    (lambda: vp.TrackingCost(0.0, [1.0, np.inf]), ("weight[1]", "inf")),
+    (lambda: vp.TrackingCost(0.0, [[1.0, 2.0], [2.0, 1.0]]), ("positive semidefinite", "-1")),
+    (lambda: vp.ControlCost(np.ones((2, 3))), ("weight", "(2, 3)")),
+    (lambda: vp.ControlCost("heavy"), ("ControlCost", "weight", "'heavy'")),
+    (lambda: vp.TrackingCost("home"), ("TrackingCost", "reference", "'home'")),
+    (lambda: vp.Terminal(vp.TrackingCost(0.0) + 2.0 * vp.ControlCost()), ("ControlCost", "terminal")),
+    (lambda: vp.Terminal(vp.Terminal(vp.TrackingCost(0.0))), "Terminal"),
+    (lambda: vp.Terminal(1.0), ("Terminal", "float")),
+    (lambda: -1.0 * vp.TrackingCost(0.0), "-1"),
+    (lambda: vp.CustomCost(3), ("CustomCost", "function", "3")),
+    (lambda: vp.CustomCost(print, 3.0, name="mine"), ("mine", "derivatives")),
+    (lambda: small(vp.ControlCost(1.0, np.zeros((19, 2)))), ("(20, 2)", "(19, 2)")),
+    (lambda: small(vp.ControlCost([1.0, 1.0, 1.0])), ("weight", "2", "(3,)")),
+    (lambda: small(vp.TrackingCost(np.zeros((20, 2)))), ("(21, 2)", "(20, 2)")),
+    (lambda: small(vp.TrackingCost([0.0, 0.0, 0.0])), ("(2,)", "(21, 2)", "(3,)")),
+    (lambda: small(vp.Terminal(vp.TrackingCost([0.0, np.nan]))), ("TrackingCost", "reference[1]", "nan")),
+]
 OF_CONSTRAINTS = [
     (lambda: reach(vp.JointTie("joint1", "joint2")), "varpin.Scene"),
     (lambda: reach(vp.WithinJointLimits(vp.planar_chain(3), (-1, 1))), "robot"),
@@ -138,7 +157,7 @@ OF_CONTROLLERS = [
 ]
 
 
-@pytest.mark.parametrize(("make", "facts"), [*OF_PROBLEMS, *OF_CONSTRAINTS, *OF_SEARCHES, *OF_CONTROLLERS])
+@pytest.mark.parametrize(("make", "facts"), [*OF_PROBLEMS, *OF_COSTS, *OF_CONSTRAINTS, *OF_SEARCHES, *OF_CONTROLLERS])
 def test_it_is_refused(make, facts):
     with refused(vp.InputError, facts):
         make()

@@ -1,4 +1,4 @@
-"""Plans that a robot can follow: what the defaults promise holds on the continuous robot, or the plan says so."""
+"""What the defaults promise holds on the continuous robot, or the plan says so."""
 
 import logging
 import re
@@ -69,7 +69,7 @@ def test_samples_at_midpoints_alone_are_told_of(load, caplog):
 
 
 def test_dampers_faster_than_the_step(load):
-    """A wrist that stops at 735/s, in steps of 10 ms: two stages lose a tenth, and say what to do; four do not."""
+    """A wrist that stops at 735/s, in steps of 10 ms: two stages lose a tenth, four do not."""
     problem = reach(load("xarm7"), 1002)
     plan = vp.solve(problem.at(integrator=vp.Gauss(2)))
     truth = plan.verify(tolerance=1e-6)

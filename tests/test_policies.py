@@ -1,4 +1,4 @@
-"""Laws and policies that act once a period, at steps of their own and at finer ones, and controls by joint name."""
+"""Laws and policies that act once a period, in finer steps too, and controls by joint name."""
 
 from __future__ import annotations
 
@@ -123,7 +123,6 @@ def test_the_control_before_a_plan_by_name():
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(3), vp.RungeKutta4(), vp.ExplicitEuler()], ids=str)
 def test_a_law_is_called_once_where_each_period_begins(integrator):
-    """With the time and the state of that node; its value is held over the period, of which the last one is cut."""
     called = []
 
     def law(t, q, v):

@@ -1,4 +1,4 @@
-"""S-DDP: how fast it converges, what it says, where it begins, and problems that have no optimum or no motion."""
+"""S-DDP: how fast it converges, what it says, where it begins, and problems without an optimum."""
 
 import re
 import tracemalloc
@@ -31,7 +31,7 @@ def test_rest_costs_no_velocities(sampling):
 
 @pytest.mark.parametrize(("sampling", "hold"), [("midpoint", 1), ("gauss", 1), ("start", 1), ("midpoint", 5)])
 def test_quadratic_convergence(sampling, hold):
-    """The promised decrease goes with the square of the gradient: each is the square of the one before, in units."""
+    """Each promised decrease is the square of the one before, in units."""
     cost = vp.ControlCost(1e-2) + vp.VelocityCost(0.01)
     cost += vp.Terminal(vp.TrackingCost([-np.pi / 2, 0.0], 50.0) + vp.VelocityCost(5.0))
     # From upright to hanging in a second.
@@ -68,7 +68,7 @@ def test_reason_gives_the_numbers_behind_the_status():
 
 
 def test_a_cost_of_nothing_is_an_optimum_also_where_the_controls_are_not_unique():
-    """A goal alone: many controls reach it, so the model needs regularization, and none does better than nothing."""
+    """A goal alone: many controls reach it, so the model needs regularization."""
     goal = vp.Terminal(vp.TrackingCost([0.3, 0.1]))
     problem = vp.OptimalControlProblem(
         vp.Scene(vp.planar_chain(2), gravity=False), goal, np.zeros(2), np.zeros(2), dt=0.01, steps=50

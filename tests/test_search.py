@@ -1,4 +1,4 @@
-"""The search for a plan: what changes nothing, limits, states to start from, drives at their limits, how it ends."""
+"""The search for a plan: what changes nothing, states to start from, drives at their limits, its end."""
 
 import contextlib
 import logging
@@ -229,7 +229,7 @@ def served(effort, damping=DAMPING, begin=REST, **options):
 
 
 def test_drives_at_their_limits_take_second_derivatives(tmp_path):
-    """By first derivatives alone it takes over 200 iterations; and a search goes on with them from a file."""
+    """By first derivatives alone it takes over 200 iterations."""
     plan = vp.solve(served(35.0), check=False)
     assert plan.status.converged
     assert plan.iterations <= 40

@@ -1,4 +1,4 @@
-"""Second derivatives of steps under constraints, against differences of the steps themselves, and what is refused."""
+"""Second derivatives of steps under constraints, against differences, and what is refused."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What is done with a solution: verification, Monte Carlo, policies; against scipy, Pinocchio and sampling by hand."""
+"""What is done with a solution: verification, Monte Carlo and policies."""
 
 import dataclasses
 
@@ -131,7 +131,6 @@ def test_policy_on_velocities_and_back():
 
 
 def test_monte_carlo_against_paths_one_by_one():
-    """The prediction is exact there, and the mean that of cost_of over single simulations with the policy."""
     plan = vp.solve(linear(noise=vp.AdditiveNoise(0.2) + vp.ControlNoise(0.3), integrator=vp.Midpoint()))
     problem, rng = plan.problem, np.random.default_rng(3)
     whole = plan.monte_carlo(4000, 1)

@@ -1,4 +1,4 @@
-"""Controls that change within a step: derivatives of steps in parts, records, and what the look says of them."""
+"""Controls that change within a step: their values and means, steps in parts, functions of time."""
 
 import numpy as np
 import pytest
@@ -92,7 +92,6 @@ def test_derivatives_of_steps_in_parts_against_differences(stages, balance):
 
 @pytest.mark.parametrize(("stages", "balance"), [(2, 1e-10), (3, 1e-13)])
 def test_steps_in_parts_keep_the_order(stages, balance):
-    """Parts take the polynomial through the whole step's stages, which alone leaves an error of the method's order."""
     scene = vp.Scene(vp.planar_chain(3))
     options = {"duration": 0.48, "controls": vp.OpenLoop(push), "check": False}
     end = vp.simulate(scene, CHAIN_Q, CHAIN_V, steps=96, integrator=vp.Gauss(5), **options).q[-1]

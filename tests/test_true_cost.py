@@ -17,7 +17,7 @@ def reach(steps, controls="held", **options):
 
 @pytest.mark.parametrize("controls", ["held", "linear"])
 def test_the_plan_is_within_the_wish_of_the_optimum(controls):
-    """Coarse controls cost more, however well the robot follows: held ones 14, 3 and 1 % with 3, 6 and 12 nodes."""
+    """Coarse controls cost more, however well the robot follows."""
     optimum = vp.solve(reach(96, "linear"), check=False).cost
     for wish in (0.03, 3e-3):
         found = vp.solve(reach(3, controls), true_cost=wish, check=False).refinement
@@ -117,7 +117,7 @@ LIMITED = {"constraints": vp.WithinVelocityLimits(vp.planar_chain(2), (-2.0, 2.0
     ids=["held", "linear", "within speeds"],
 )
 def test_the_first_step_within_the_wish_is_taken(problem, wish):
-    """Within speeds the first step costs little, and violates them by more than a thousandth of their range."""
+    """Within speeds the first step costs little, but violates them."""
     plan = vp.solve(problem, true_cost=wish)
     found, truth = plan.refinement, plan.verify()
     assert found.met
