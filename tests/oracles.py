@@ -403,6 +403,14 @@ def violation(problem: vp.OptimalControlProblem, motion: vp.Trajectory, controls
     return max(0.0, *(float(part.max(initial=0.0)) for part in (below, np.abs(zero), beyond)))
 
 
+def given(problem: vp.OptimalControlProblem) -> list[int]:
+    """Which of the first controls the start gives: on lines the positions of inputs, and the rates of cubic ones."""
+    inputs = [own for own in problem.scene.constraints if isinstance(own, vp.KinematicInput)]
+    joints = list(problem.scene.robot.joint_names)
+    first = [*(joints.index(own.joint) for own in inputs), *range(len(joints), problem.scene.controls)]
+    return first if problem.controls == "linear" else []
+
+
 def kkt(plan: vp.Solution, near: float = 1e-5) -> float:
     """What is left of the Lagrangian's gradient in the controls; 1 is the cost's gradient at controls a tenth smaller.
 
@@ -423,6 +431,7 @@ def kkt(plan: vp.Solution, near: float = 1e-5) -> float:
 
     below, _ = plan_rows(problem, plan.trajectory, u)
     found, (low, high) = slopes(u), problem.control_limits
+    found[:, given(problem)] = 0.0
     met = np.concatenate([below > -near, np.ones(len(found) - 1 - len(below), dtype=bool)])
     free = np.concatenate([np.zeros(len(below), dtype=bool), np.ones(len(found) - 1 - len(below), dtype=bool)])[met]
     ends = np.concatenate([np.eye(u.size)[(u >= high - near).ravel()], -np.eye(u.size)[(u <= low + near).ravel()]])

@@ -1,4 +1,4 @@
-"""Backward passes: the equations with whole matrices, 60 digits where weights lie far apart, and refusals."""
+"""Backward passes: equations with whole matrices, and 60 digits where weights lie far apart."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ EXTREMES = (1e-9, 1.0, 1e9)
 
 
 def random_steps(dof, m, k, *, seed, steps=6):
-    """Steps for a backward pass with nothing special about them, every Hessian positive definite."""
     rng = np.random.default_rng(seed)
     x, size = 2 * dof, 2 * dof + m
 
@@ -39,7 +38,6 @@ def random_steps(dof, m, k, *, seed, steps=6):
 
 
 def empty(given, hold):
-    """Arrays for a pass to fill in."""
     (N, x, m), k = given["B"].shape, given["G"].shape[2]
     R = N // hold
     return {
@@ -144,7 +142,6 @@ def test_two_blocks_are_one_pass():
 @pytest.mark.parametrize("hold", [1, 3])
 @pytest.mark.parametrize("limited", [False, True])
 def test_the_linearized_motion_under_gains_is_the_sum_of_its_steps(hold, limited):
-    """With controls that are clipped to their slack, and the states after all steps, also within a decision."""
     given = random_steps(2, 2, 0, seed=4)
     A, B, R, rng = given["A"], given["B"], 6 // hold, np.random.default_rng(5)
     slack = np.zeros((0, 2, 2))
@@ -195,7 +192,6 @@ def exact(array):
 
 
 def solved(A, B):
-    """Gaussian elimination, column by column."""
     A, B, n = A.copy(), B.copy(), len(A)
     for k in range(n):
         for i in range(k + 1, n):
@@ -228,7 +224,7 @@ def riccati(A, B, gradient, hessian, end_gradient, end_hessian, h):
 
 
 def made_up(inertia, control, running, terminal, *, steps=20, h=1e-2):
-    """Three coupled springs, three controls: A, B, gradient and Hessian of the running cost and of the end's."""
+    """Three coupled springs: A, B, gradient and Hessian of the running cost and of the end's."""
     n, rng = 3, np.random.default_rng(0)
     scale = np.sqrt(np.outer(inertia, inertia))
     A, B = np.zeros((steps, 2 * n, 2 * n)), np.zeros((steps, 2 * n, n))
@@ -247,7 +243,7 @@ def made_up(inertia, control, running, terminal, *, steps=20, h=1e-2):
 
 
 def off(found, right):
-    """Largest error, for each node and each control in units of the largest entry of its own row over all states."""
+    """Largest error, in units of the largest entry of its row over all states."""
     size = np.abs(right).max(axis=-1, keepdims=True)
     return (np.abs(found - right) / np.where(size > 0.0, size, 1.0)).max()
 
@@ -295,7 +291,7 @@ def reach(robot, control, running, terminal, **options):
 
 
 def test_an_optimum_at_extreme_weights_is_found_at_once():
-    """Springs without gravity are linear: one step of the search, where the plain recursion finds no minimum."""
+    """Where the plain recursion finds no minimum."""
     robot = vp.planar_chain(2)
     scene = vp.Scene(robot, gravity=False)
     cost = vp.ControlCost(1e-9) + vp.Terminal(vp.TrackingCost([1e-3, -1e-3], 1e9) + vp.VelocityCost(1e7))
@@ -306,7 +302,7 @@ def test_an_optimum_at_extreme_weights_is_found_at_once():
 
 
 def test_what_is_lost_is_told(caplog):
-    """Six decades of inertia under eighteen of weights: the plan, and what rounding may have done to it."""
+    """Six decades of inertia under eighteen of weights."""
     sol = vp.solve(reach("finger", 1e-9, 1e-9, 1e9, integrator=vp.Midpoint(), sampling="midpoint"))
     assert about(sol.reason, "rounding in Quu")
     assert about(caplog.messages, "untrusted gains")

@@ -1,10 +1,9 @@
-"""Controls of scenes with kinematic inputs: functions of time, lines, laws and policies, beside forces."""
-
-import functools
+"""Controls of scenes with kinematic inputs: functions of time, lines, policies, and plans on lines."""
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from oracles import exact, lines, slope
+from plan_problems import hand
 
 import varpin as vp
 
@@ -36,25 +35,7 @@ def wanted(scene, t):
 Q0, V0 = np.array([path(0.0), 0.5, -0.4]), np.array([rate(0.0), 0.0, 0.0])
 
 
-@functools.cache
-def truth():
-    """(q, v) at the end, by DOP853 with the acceleration of the first joint given."""
-    free = vp.Scene(vp.planar_chain(3))
-
-    def slope(t, x):
-        q, v = x[:3].copy(), x[3:].copy()
-        q[0], v[0] = path(t), rate(t)
-        jet = vp.lagrangian_jet(free, q, v)
-        bias = jet.Lq - jet.Lvq @ v + np.array([0.0, torque(t), 0.0])
-        a = np.array([-3.6 * np.sin(3.0 * t), 0.0, 0.0])
-        a[1:] = np.linalg.solve(jet.Lvv[1:, 1:], bias[1:] - jet.Lvv[1:, 0] * a[0])
-        return np.append(v, a)
-
-    return solve_ivp(slope, (0.0, SPAN), np.append(Q0, V0), "DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
-
-
 def test_a_motion_under_a_function_of_time_is_linearized():
-    """Against differences in the position and the velocity at the end of the step, and in a force held over it."""
     scene = arm("cubic")
     begin = wanted(scene, 0.01)
 
@@ -63,13 +44,13 @@ def test_a_motion_under_a_function_of_time_is_linearized():
         return vp.simulate(scene, Q0, V0, dt=0.01, steps=1, controls=controls, integrator=vp.Gauss(2), check=False)
 
     lin = vp.linearize(scene, step(begin))
+
+    def end(u):
+        return np.append(step(u).q[1], step(u).p[1])
+
     for c, size in enumerate((1e-4, 1e-2, 1e-2)):
-        e = size * np.eye(3)[c]
-        slope = np.zeros(6)
-        for k, w in {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}.items():
-            ends = [step(begin + s * k * e) for s in (1, -1)]
-            slope += w / size * (np.append(ends[0].q[1], ends[0].p[1]) - np.append(ends[1].q[1], ends[1].p[1]))
-        np.testing.assert_allclose(lin.B[0, :, c], slope, atol=1e-8 * np.abs(lin.B[0]).max())
+        found = slope(end, begin, np.eye(3)[c], size)
+        np.testing.assert_allclose(lin.B[0, :, c], found, atol=1e-8 * np.abs(lin.B[0]).max())
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
@@ -86,13 +67,17 @@ def test_a_tolerance_follows_a_function_of_time():
     scene = arm("cubic")
     controls = vp.OpenLoop(lambda t: wanted(scene, t))
     found = vp.simulate(scene, Q0, V0, duration=SPAN, tolerance=1e-6, controls=controls)
-    assert np.abs(found.q[-1] - truth()[:3]).max() < 1e-6
+
+    def way(t):
+        return np.array([path(t)]), np.array([rate(t)]), np.array([-3.6 * np.sin(3.0 * t)])
+
+    own = exact(scene, Q0, V0, [0.0, SPAN], lambda k, q, v: lambda t: wanted(scene, t), path=way)
+    assert np.abs(found.q[-1] - own.q[-1]).max() < 1e-6
 
 
 @pytest.mark.parametrize("linear", [False, True])
 @pytest.mark.parametrize("hold", [1, 3])
 def test_a_policy_moves_an_input_over_its_intervals(hold, linear):
-    """With feedback of the free joints on the position; rows of the record repeat the motion."""
     scene = arm("linear")
     dt, N = 0.01, 10
     t = hold * dt * np.arange(N + 1)
@@ -116,3 +101,57 @@ def test_a_policy_moves_an_input_over_its_intervals(hold, linear):
         np.testing.assert_allclose(paths.q[0], motion.q, atol=1e-13)
         np.testing.assert_allclose(paths.u[0], motion.u, atol=1e-13)
     np.testing.assert_allclose(vp.linearize(scene, motion).B[:, 0, 0], 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_a_controller_takes_them(interpolation):
+    problem = hand(interpolation, steps=12, dt=0.04)
+    run = vp.Mpc(problem).run(vp.Plant(problem.scene, substeps=3), duration=1.2)
+    np.testing.assert_allclose(run.motion.q[1:, 0], run.motion.u[:, 0], atol=1e-12)
+    np.testing.assert_allclose(run.motion.q[-1], [0.4, -0.6, 0.2], atol=0.1)
+
+
+@pytest.mark.parametrize("controls", ["held", "linear"])
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_searches_start_on_states(interpolation, controls):
+    problem = hand(interpolation, controls=controls)
+    own = vp.solve(problem, tolerance=1e-12, check=False)
+    share = np.linspace(0.0, 1.0, problem.steps + 1)[:, None]
+    states = problem.q0 + share * (np.array([0.3, -0.4, 0.1]) - problem.q0)
+    found = vp.solve(problem, states=states, tolerance=1e-12, check=False)
+    assert found.status.converged
+    assert found.cost == pytest.approx(own.cost, rel=1e-9)
+    np.testing.assert_allclose(found.trajectory.q, own.trajectory.q, atol=1e-5)
+    # The first motion of no iterations is on the states.
+    first = vp.solve(problem, states=own.trajectory, max_iterations=0, check=False)
+    np.testing.assert_allclose(first.trajectory.q[:, 0], own.trajectory.q[:, 0], atol=1e-12)
+
+
+def test_noise_of_the_position_of_an_input_is_differentiated_at_the_end_of_the_step():
+    own = vp.CustomNoise(
+        lambda q, v, u: np.array([[0.0], [u[0] * u[1]], [u[0] ** 2]]),
+        1,
+        du=lambda q, v, u: np.array([[[0.0] * 3], [[u[1], u[0], 0.0]], [[2.0 * u[0], 0.0, 0.0]]]),
+        check=True,
+    )
+    problem = hand("linear", steps=1, noise=own)
+    u, step = np.array([0.1, -0.2, 0.3, 0.5, 0.1, -0.3]), 1e-5
+
+    def linearized(ends):
+        return vp.linearize(problem.scene, problem.simulate(lines(problem, ends.reshape(2, 3))))
+
+    lin = linearized(u)
+    first = lin.F[0, :, 0]
+    np.testing.assert_allclose(first, [0.0, u[3] * 0.5 * (u[1] + u[4]), u[3] ** 2], atol=1e-12)
+    slope = np.array([0.0, u[3] * (u[4] - u[1]), 0.0]) / np.sqrt(12.0)
+    np.testing.assert_allclose(lin.G[0], lin.J[0] @ np.stack([first, slope], axis=1), atol=1e-12)
+    for c in range(6):
+        away = step * np.eye(6)[c]
+        # The Jacobian of the step stays: it is the fields that are differentiated.
+        fields = []
+        for at in (u + away, u - away):
+            mean, last = 0.5 * (at[1] + at[4]), at[3]
+            fields.append(np.array([[0.0, last * mean, last**2], [0.0, last * (at[4] - at[1]) / np.sqrt(12.0), 0.0]]).T)
+        expected = lin.J[0] @ (fields[0] - fields[1]) / (2.0 * step)
+        found = (lin.Gramp if c >= 3 else lin.Gu - lin.Gramp)[0, :, :, c % 3]
+        np.testing.assert_allclose(found, expected, atol=1e-8)

@@ -1,4 +1,4 @@
-"""Costs: every term against NumPy and Pinocchio, sums, references, functions of one's own, and what is refused."""
+"""Costs: every term against NumPy and Pinocchio, sums, references, and functions of one's own."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import mechanisms
 import numpy as np
 import pinocchio as pin
 import pytest
-from oracles import WORLD
+from oracles import Mechanism, placements, slope
+from plan_problems import linear, small
 from refusals import refused
 from scipy.interpolate import CubicHermiteSpline
-from test_sddp import SAMPLINGS, run, sliders, small
 
 import varpin as vp
 from varpin.control.costs import Points
@@ -48,21 +48,15 @@ def samples(rng, robot):
 
 
 def plain(residual, J, weight, columns, size):
-    """Values, gradients and the Hessians of Gauss and Newton of weight . r^2, for r (N, r) and J (N, r, c)."""
     gradient, hessian = np.zeros((N, size)), np.zeros((N, size, size))
     gradient[:, columns] = 2.0 * np.einsum("Nrc,rs,Ns->Nc", J, weight, residual)
     hessian[:, columns, columns] = 2.0 * np.einsum("Nrc,rs,Nsd->Ncd", J, weight, J)
     return np.einsum("Nr,rs,Ns->N", residual, weight, residual), gradient, hessian
 
 
-def slopes_in_q(function, q, step=1e-2):
-    """Derivative (N, ..., n) of a function of q (N, n), by differences of eighth order."""
-    weights = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
-    columns = [
-        sum(w * (function(q + k * e) - function(q - k * e)) for k, w in weights.items()) / step
-        for e in step * np.eye(q.shape[1])
-    ]
-    return np.stack(columns, axis=-1)
+def slopes_in_q(function, q):
+    """Derivative (N, ..., n) of a function of q (N, n)."""
+    return np.stack([slope(function, q, e, 1e-2) for e in np.eye(q.shape[1])], axis=-1)
 
 
 def masses(robot, q):
@@ -74,7 +68,6 @@ def masses(robot, q):
 
 
 def terms(rng, robot, frame, q, v, u):
-    """Costs, and what each is in NumPy."""
     n, size = robot.dof, 2 * robot.dof + CONTROLS
     kinematics = frame_kinematics(robot, frame)
     R, p, J = kinematics.jacobians(q)
@@ -94,13 +87,8 @@ def terms(rng, robot, frame, q, v, u):
     turns *= np.sign(np.linalg.det(turns))[:, None, None]
     error = np.array([pin.log3(target.T @ own) for target, own in zip(turns, R, strict=True)])
     turn = np.array([pin.Jlog3(target.T @ own) for target, own in zip(turns, R, strict=True)])
-    add(
-        vp.FrameOrientationCost(robot, frame, turns, W),
-        W,
-        error,
-        turn @ np.swapaxes(R, 1, 2) @ J[:, 3:],
-        slice(0, n),
-    )
+    of_turn = turn @ np.swapaxes(R, 1, 2) @ J[:, 3:]
+    add(vp.FrameOrientationCost(robot, frame, turns, W), W, error, of_turn, slice(0, n))
     W, twist = spd(rng, 6), rng.normal(size=(N, 6))
     in_q = slopes_in_q(lambda q: (kinematics.jacobians(q)[2] @ v[:, :, None])[..., 0], q)
     slopes = np.concatenate([in_q, J], axis=2)
@@ -124,13 +112,8 @@ def terms(rng, robot, frame, q, v, u):
     for kind, y, begin in ((vp.JointLimitBarrier, q, 0), (vp.VelocityLimitBarrier, v, n)):
         W, lower, upper = spd(rng, n), np.full(n, -0.5), np.linspace(0.3, 0.6, n)
         beyond = y - np.clip(y, lower + 0.1, upper - 0.1)
-        add(
-            kind(robot, W, 0.1, (lower, upper)),
-            W,
-            beyond,
-            np.eye(n) * (beyond != 0.0)[:, None],
-            slice(begin, begin + n),
-        )
+        slopes = np.eye(n) * (beyond != 0.0)[:, None]
+        add(kind(robot, W, 0.1, (lower, upper)), W, beyond, slopes, slice(begin, begin + n))
     return found
 
 
@@ -146,26 +129,22 @@ def test_every_term_is_what_it_is_in_numpy(rng, robot, frame):
 
 
 def test_sums_scale_and_add_up(rng, robot, frame):
-    """Of terms in the core, and of others beside them."""
     at = samples(rng, robot)
     found = terms(rng, robot, frame, *at)
     factors = rng.uniform(0.5, 2.0, len(found))
+    last = 2 * robot.dof
+    unit = np.eye(last + CONTROLS)[last]
     custom = vp.CustomCost(
         lambda t, q, v, u: u[:, 0] ** 2,
-        lambda t, q, v, u: (
-            2.0 * u[:, :1] * np.eye(2 * robot.dof + CONTROLS)[2 * robot.dof],
-            np.tile(2.0 * np.diag(np.eye(2 * robot.dof + CONTROLS)[2 * robot.dof]), (N, 1, 1)),
-        ),
+        lambda t, q, v, u: (2.0 * u[:, :1] * unit, np.tile(2.0 * np.diag(unit), (N, 1, 1))),
     )
     cost = sum((factor * own for factor, (own, _) in zip(factors, found, strict=True)), start=custom)
     bound = cost.bind(points(robot))
-
     expansion = bound.expand(*at)
     expected = [sum(f * parts[i] for f, (_, parts) in zip(factors, found, strict=True)) for i in range(3)]
-    last = 2 * robot.dof
     expected[0] = expected[0] + at[2][:, 0] ** 2
-    expected[1][:, last] += 2.0 * at[2][:, 0]
-    expected[2][:, last, last] += 2.0
+    expected[1] += 2.0 * at[2][:, :1] * unit
+    expected[2] += 2.0 * np.diag(unit)
     np.testing.assert_allclose(bound.value(*at), expected[0], rtol=1e-12)
     np.testing.assert_allclose(expansion.gradient, expected[1], rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(expansion.hessian, expected[2], rtol=1e-10, atol=1e-10)
@@ -174,7 +153,6 @@ def test_sums_scale_and_add_up(rng, robot, frame):
 
 
 def test_manipulability_where_there_is_none(load):
-    """The slope of |det J| is that of cofactors, whichever rows of J are dependent, and zero where two are lost."""
     robot = load("ur5")
     frame = frame_kinematics(robot, "tool0")
     straight = np.array([0.3, -1.0, 0.0, 0.4, 0.9, 0.2])  # elbow
@@ -191,7 +169,6 @@ def test_manipulability_where_there_is_none(load):
 
 
 def tree(seed):
-    """A random tree with a frame set apart on its deepest joint."""
     model = mechanisms.random_tree(seed)
     rng = np.random.default_rng(seed)
     depths = [len(path) for path in model.supports]
@@ -200,33 +177,18 @@ def tree(seed):
     return vp.load_robot(model)
 
 
-def pinocchio_frame(robot, frame, q, v):
-    """Rotation, position and twist (6,) in world axes, joint by joint in Pinocchio."""
-    model, data = robot.model, robot.model.createData()
-    pin.forwardKinematics(model, data, robot.configuration(q), robot.velocity(v))
-    pin.updateFramePlacements(model, data)
-    index = model.getFrameId(frame)
-    placed = data.oMf[index]
-    return placed.rotation.copy(), placed.translation.copy(), pin.getFrameVelocity(model, data, index, WORLD).vector
-
-
 @pytest.mark.parametrize("name", ["tree0", "tree1", "tree2", "ur5", "panda", "kinova"])
 def test_frames(load, rng, name):
     """Panda's fingers are tied to each other."""
     robot = tree(int(name[4:])) if name.startswith("tree") else load(name)
     frame = "hand" if name.startswith("tree") else robot.end_effector
     q, v, _ = samples(rng, robot)
-    kinematics = frame_kinematics(robot, frame)
+    kinematics, own = frame_kinematics(robot, frame), Mechanism(vp.Scene(robot, damping=0.0))
     R, p, J = kinematics.jacobians(q)
-    gear = robot.velocity(np.eye(robot.dof)).T
-    model, data, index = robot.model, robot.model.createData(), robot.model.getFrameId(frame)
     for k in range(N):
-        rotation, position, twist = pinocchio_frame(robot, frame, q[k], v[k])
-        np.testing.assert_allclose(R[k], rotation, atol=1e-13)
-        np.testing.assert_allclose(p[k], position, atol=1e-13)
-        np.testing.assert_allclose(J[k] @ v[k], twist, atol=1e-12)
-        whole = pin.computeFrameJacobian(model, data, robot.configuration(q[k]), index, WORLD)
-        np.testing.assert_allclose(J[k], whole @ gear, atol=1e-13)
+        own.place(q[k], v[k])
+        for found, expected in zip((p[k], R[k], J[k]), own.point(frame), strict=False):
+            np.testing.assert_allclose(found, expected, atol=1e-13)
     for placed, once_more in zip(kinematics.placements(q), (R, p), strict=True):
         np.testing.assert_array_equal(placed, once_more)
 
@@ -238,10 +200,9 @@ def turn(axis, angle):
 @pytest.mark.parametrize("axis", [(2, -1, 2), (-9, 2, 6), (2, 9, -6), (0, 0, 1)])
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 9.9e-4, 1.01e-3, 0.5, 3.0, np.pi - 1e-5])
 def test_orientation_at_every_distance(load, angle, axis):
-    """The rotation vector from the target is exact, and its derivative, near no turn and near half a turn, too."""
     robot = load("ur5")
     q, v = np.random.default_rng(2).uniform(-1.5, 1.5, (2, 1, 6))
-    R = pinocchio_frame(robot, "tool0", q[0], v[0])[0]
+    R = placements(robot, q, "tool0")[0].rotation
     axis = np.array(axis) / np.linalg.norm(axis)
     W = np.diag([1.0, 2.0, 3.0])
     bound = vp.FrameOrientationCost(robot, "tool0", R @ turn(axis, angle).T, W).bind(Points(np.zeros(1), 1.0, 1, 6, 6))
@@ -255,11 +216,10 @@ def test_orientation_at_every_distance(load, angle, axis):
 
 
 def test_targets_in_time(load, rng):
-    """Functions are sampled at the points, rows are linear between nodes, rotations turn evenly."""
     robot, steps = load("ur5"), 4
     t, nodes = (np.arange(steps) + 0.5) * 0.25, np.linspace(0.0, 1.0, steps + 1)
     q, v = rng.uniform(-1.5, 1.5, (2, steps, 6))
-    at = [pinocchio_frame(robot, "tool0", *row) for row in zip(q, v, strict=True)]
+    at = placements(robot, q, "tool0")
 
     def path(t):
         return np.array([t, 1.0 - t, 0.3])
@@ -267,8 +227,8 @@ def test_targets_in_time(load, rng):
     def turning(t):
         return turn([1, 1, 0], 2.0 * t)
 
-    away = [((p - path(time)) ** 2).sum() for time, (_, p, _) in zip(t, at, strict=True)]
-    turned = [(pin.log3(turning(time).T @ R) ** 2).sum() for time, (R, _, _) in zip(t, at, strict=True)]
+    away = [((place.translation - path(time)) ** 2).sum() for time, place in zip(t, at, strict=True)]
+    turned = [(pin.log3(turning(time).T @ place.rotation) ** 2).sum() for time, place in zip(t, at, strict=True)]
     for kind, target, expected in ((vp.FramePositionCost, path, away), (vp.FrameOrientationCost, turning, turned)):
         for given in (target, np.array([target(time) for time in nodes])):
             bound = kind(robot, "tool0", given).bind(Points(t, 1.0, steps, 6, 6))
@@ -277,7 +237,6 @@ def test_targets_in_time(load, rng):
 
 @pytest.mark.parametrize(("steps", "dt"), [(7, 0.1), (300, 1e-3), (99, 1 / 3)])
 def test_references_in_rows(steps, dt):
-    """A row for each step is constant over it, from the node where it begins on, rounding or not; N + 1 are linear."""
     rows, nodes = np.arange(1.0, steps + 1.0)[:, None] * np.ones(2), np.arange(steps + 1.0)[:, None] * np.ones(2)
     zero = np.zeros((steps, 3))
     for place in (0.0, 0.5 - np.sqrt(3.0) / 6.0, 0.5, 0.5 + np.sqrt(3.0) / 6.0):
@@ -286,14 +245,12 @@ def test_references_in_rows(steps, dt):
         np.testing.assert_allclose(value, 2 * rows[:, 0] ** 2, rtol=1e-15)
     value = vp.ControlCost(1.0, nodes).bind(at).value(zero, zero, zero[:, :2])
     np.testing.assert_allclose(value, 2 * (np.arange(steps) + place) ** 2, rtol=1e-9)
-    end = vp.TrackingCost(np.outer(np.arange(steps + 1.0), np.ones(3))).bind(
-        Points(np.array([dt * steps]), dt * steps, steps, 3, 2)
-    )
+    last = Points(np.array([dt * steps]), dt * steps, steps, 3, 2)
+    end = vp.TrackingCost(np.outer(np.arange(steps + 1.0), np.ones(3))).bind(last)
     np.testing.assert_allclose(end.value(zero[:1], zero[:1], zero[:1, :2]), 3 * steps**2, rtol=1e-12)
 
 
 def test_sums_and_scales():
-    """Of every term, whose kind and place stay; numbers multiply."""
     track, end = vp.TrackingCost(0.0, 2.0), vp.Terminal(vp.TrackingCost(0.0) + vp.VelocityCost())
     cost = np.float64(2.0) * (track + end) * 1
     assert [(type(term), term.factor, term.at_end) for term in cost.terms] == [
@@ -304,9 +261,6 @@ def test_sums_and_scales():
     for wrong in (lambda: track + 1.0, lambda: 1 + track, lambda: "2" * track, lambda: track * track):
         with pytest.raises(TypeError):
             wrong()
-    built_in = vp.solve(small(vp.TrackingCost([1.0, 0.0], 6.0) + vp.ControlCost(0.2) + vp.Terminal(track)))
-    own = vp.solve(small(2.0 * (vp.TrackingCost([1.0, 0.0], 3.0) + vp.ControlCost(0.1) + vp.Terminal(0.5 * track))))
-    np.testing.assert_allclose(own.controls, built_in.controls, rtol=0, atol=1e-12 * np.abs(built_in.controls).max())
 
 
 def samples_of_a_step(sampling, h):
@@ -322,42 +276,34 @@ def samples_of_a_step(sampling, h):
     return [(0.5 * w, s, motion(s * h), motion(s * h, 1)) for w, s in zip(weights, places, strict=True)]
 
 
-@pytest.mark.parametrize("sampling", SAMPLINGS)
+@pytest.mark.parametrize("sampling", ["midpoint", "gauss", "start"])
 def test_problem_is_an_integral(sampling):
-    """A sum over the samples of each step, and the terminal cost once."""
-    scene = vp.Scene(sliders(2), gravity=False)
     each_step = vp.TrackingCost(lambda t: [t, 0.0], 2.0) + vp.VelocityCost(0.3) + vp.ControlCost(0.1)
     cost = each_step + vp.Terminal(vp.TrackingCost([1.0, 0.0], 3.0) + vp.VelocityCost(0.7))
-    problem = vp.OptimalControlProblem(scene, cost, [0.3, 0.1], [0.2, 0.0], dt=0.1, steps=8, sampling=sampling)
-    motion = run(problem, np.random.default_rng(0).normal(size=(8, 2)))
+    problem = linear().at(cost=cost, dt=0.1, steps=8, sampling=sampling).at(t0=0.7)
+    motion = problem.simulate(np.random.default_rng(0).normal(size=(8, 2)))
     total = 3 * ((motion.q[-1] - [1.0, 0.0]) ** 2).sum() + 0.7 * (motion.v[-1] ** 2).sum()
     for k in range(8):
         nodes = motion.q[k], motion.v[k], motion.q[k + 1], motion.v[k + 1]
         for weight, place, in_q, in_v in samples_of_a_step(sampling, 0.1):
-            t, q, v = (k + place) * 0.1, np.dot(in_q, nodes), np.dot(in_v, nodes)
+            t, q, v = 0.7 + (k + place) * 0.1, np.dot(in_q, nodes), np.dot(in_v, nodes)
             running = 2 * ((q - [t, 0.0]) ** 2).sum() + 0.3 * (v**2).sum() + 0.1 * (motion.u[k] ** 2).sum()
             total += 0.1 * weight * running
     assert problem.cost_of(motion) == pytest.approx(total, rel=1e-13)
 
 
 def smooth(t, q, v, u):
-    return np.sin(q[:, 0] + t) * v[:, 1] + np.exp(0.3 * q[:, 1]) * u[:, 0] ** 2 + np.cos(v[:, 2] * u[:, 1])
+    return np.sin(q[:, 0] + t) * v[:, 1] + np.exp(0.3 * q[:, 1]) * u[:, 0] ** 2
 
 
 def smooth_derivatives(t, q, v, u):
     gradient, hessian = np.zeros((len(t), 8)), np.zeros((len(t), 8, 8))
-    s, c = np.sin(q[:, 0] + t), np.cos(q[:, 0] + t)
-    e = np.exp(0.3 * q[:, 1])
-    a, b = v[:, 2] * u[:, 1], v[:, 2]
+    s, c, e, w = np.sin(q[:, 0] + t), np.cos(q[:, 0] + t), np.exp(0.3 * q[:, 1]), u[:, 0]
     gradient[:, 0], gradient[:, 4] = c * v[:, 1], s
-    gradient[:, 1], gradient[:, 6] = 0.3 * e * u[:, 0] ** 2, 2 * e * u[:, 0]
-    gradient[:, 5], gradient[:, 7] = -np.sin(a) * u[:, 1], -np.sin(a) * b
-    hessian[:, 0, 0], hessian[:, 0, 4] = -s * v[:, 1], c
-    hessian[:, 1, 1], hessian[:, 1, 6], hessian[:, 6, 6] = 0.09 * e * u[:, 0] ** 2, 0.6 * e * u[:, 0], 2 * e
-    hessian[:, 5, 5], hessian[:, 7, 7] = -np.cos(a) * u[:, 1] ** 2, -np.cos(a) * b**2
-    hessian[:, 5, 7] = -np.cos(a) * a - np.sin(a)
-    lower = np.tril_indices(8, -1)
-    hessian[:, lower[0], lower[1]] = hessian[:, lower[1], lower[0]]
+    gradient[:, 1], gradient[:, 6] = 0.3 * e * w**2, 2 * e * w
+    hessian[:, 0, 0], hessian[:, 0, 4], hessian[:, 4, 0] = -s * v[:, 1], c, c
+    hessian[:, 1, 1], hessian[:, 6, 6] = 0.09 * e * w**2, 2 * e
+    hessian[:, 1, 6] = hessian[:, 6, 1] = 0.6 * e * w
     return gradient, hessian
 
 
@@ -371,7 +317,6 @@ def somewhere(seed=0, scale=1.0):
 
 @pytest.mark.parametrize("scale", [0.1, 1.0])
 def test_custom_cost_from_its_value_alone(scale):
-    """Gradient to 1e-8 and Hessian to 1e-5 of the function's size, for one that varies over lengths of about 1."""
     at = somewhere(3, scale)
     gradient, hessian = smooth_derivatives(GRID.t, *at)
     bound = vp.CustomCost(smooth).bind(GRID)
@@ -379,10 +324,6 @@ def test_custom_cost_from_its_value_alone(scale):
     assert np.abs(found.gradient - gradient).max() < 1e-8 * size
     assert np.abs(found.hessian - hessian).max() < 1e-5 * size
     np.testing.assert_array_equal(found.hessian, np.swapaxes(found.hessian, 1, 2))
-    built_in = vp.solve(small(vp.TrackingCost([1.0, 0.0], 2.0) + vp.ControlCost(0.1)))
-    alone = vp.CustomCost(lambda t, q, v, u: 2.0 * ((q - [1.0, 0.0]) ** 2).sum(axis=1))
-    own = vp.solve(small(alone + vp.ControlCost(0.1)))
-    np.testing.assert_allclose(own.controls, built_in.controls, rtol=0, atol=1e-7 * np.abs(built_in.controls).max())
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-3, 0.1, 1.0])
@@ -392,18 +333,14 @@ def test_derivatives_that_are_right_pass_the_check(scale, size):
         lambda *z: size * smooth(*z), lambda *z: tuple(size * x for x in smooth_derivatives(*z)), check=True
     )
     cost.bind(GRID).expand(*somewhere(5, scale))
-    target = np.arange(3) + 1.0
+    # At its minimum, where value and gradient are zero; one Hessian for all points stays one.
     square = vp.CustomCost(
-        lambda t, q, v, u: size * ((q - target) ** 2).sum(axis=1),
-        lambda t, q, v, u: (
-            size * 2 * np.hstack([q - target, np.zeros((N, 5))]),
-            size * 2 * np.diag([1.0] * 3 + [0.0] * 5)[None],
-        ),
+        lambda t, q, v, u: size * (u**2).sum(axis=1),
+        lambda t, q, v, u: (size * 2 * np.hstack([q, v, u]), size * 2 * np.diag([0.0] * 6 + [1.0] * 2)[None]),
         check=True,
     )
-    # At its minimum, where value and gradient are zero; one Hessian for all points stays one.
-    q = np.tile(target, (N, 1))
-    assert square.bind(GRID).expand(q, 0 * q, np.zeros((N, 2))).hessian.shape == (1, 8, 8)
+    zero = np.zeros((N, 3))
+    assert square.bind(GRID).expand(zero, zero, zero[:, :2]).hessian.shape == (1, 8, 8)
 
 
 @pytest.mark.parametrize(
@@ -415,7 +352,6 @@ def test_derivatives_that_are_right_pass_the_check(scale, size):
     ],
 )
 def test_check_finds_a_wrong_derivative(order, where, facts):
-    """At the first expansion and not after it: it costs as much as leaving the derivatives out."""
     wrong, calls = [1.0], []
 
     def derivatives(*z):
@@ -459,41 +395,10 @@ def test_derivatives_that_cannot_be():
 @pytest.mark.parametrize(
     ("make", "facts"),
     [
-        (lambda: vp.TrackingCost(0.0, np.nan), ("TrackingCost", "weight", "nan")),
-        (lambda: vp.TrackingCost(0.0, [1.0, np.inf]), ("weight[1]", "inf")),
-        (lambda: vp.TrackingCost(0.0, [[1.0, 2.0], [2.0, 1.0]]), ("positive semidefinite", "-1")),
-        (lambda: vp.VelocityCost([1.0, -2.0]), ("VelocityCost", "weight", "-2")),
-        (lambda: vp.ControlCost(np.ones((2, 3))), ("weight", "(2, 3)")),
-        (lambda: vp.ControlCost("heavy"), ("ControlCost", "weight", "'heavy'")),
-        (lambda: vp.TrackingCost("home"), ("TrackingCost", "reference", "'home'")),
-        (lambda: vp.Terminal(vp.TrackingCost(0.0) + 2.0 * vp.ControlCost()), ("ControlCost", "terminal")),
-        (lambda: vp.Terminal(vp.Terminal(vp.TrackingCost(0.0))), "Terminal"),
-        (lambda: vp.Terminal(1.0), ("Terminal", "float")),
-        (lambda: -1.0 * vp.TrackingCost(0.0), "-1"),
-        (lambda: np.nan * vp.TrackingCost(0.0), "nan"),
-        (lambda: vp.CustomCost(3), ("CustomCost", "function", "3")),
-        (lambda: vp.CustomCost(None), ("CustomCost", "function", "None")),
-        (lambda: vp.CustomCost(smooth, 3.0, name="mine"), ("mine", "derivatives")),
-        (lambda: small(vp.ControlCost(1.0, np.zeros((19, 2)))), ("(20, 2)", "(19, 2)")),
-        (lambda: small(vp.ControlCost([1.0, 1.0, 1.0])), ("weight", "2", "(3,)")),
-        (lambda: small(vp.TrackingCost(np.zeros((20, 2)))), ("(21, 2)", "(20, 2)")),
-        (lambda: small(vp.TrackingCost([0.0, 0.0, 0.0])), ("(2,)", "(21, 2)", "(3,)")),
-        (lambda: small(vp.Terminal(vp.TrackingCost([0.0, np.nan]))), ("TrackingCost", "reference[1]", "nan")),
-    ],
-)
-def test_what_is_refused(make, facts):
-    with refused(vp.InputError, facts):
-        make()
-
-
-@pytest.mark.parametrize(
-    ("make", "facts"),
-    [
         (lambda r: vp.FramePositionCost(r, [0, 0, 0], "tip"), ("FramePositionCost", "[0, 0, 0]")),
         (lambda r: vp.FrameVelocityCost(r, "base_link"), ("'base_link'", "'ur5'")),
         (lambda r: vp.JointLimitBarrier("ur5"), "str"),
         (lambda r: vp.FramePositionCost(r, "tool0", [0, 0, 0], [1, 2]), ("FramePositionCost weight", "3")),
-        (lambda r: vp.FrameVelocityCost(r, "tool0", 0.0, -1.0), ("FrameVelocityCost weight", "positive semidefinite")),
         (lambda r: vp.ManipulabilityCost(r, "tool0", 0.1, directions=["x", "x"]), "ManipulabilityCost directions"),
         (lambda r: vp.ManipulabilityCost(r, "tool0", 0.1, directions="up"), "ManipulabilityCost directions"),
         (lambda r: vp.ManipulabilityCost(r, "tool0", 0.0), "ManipulabilityCost least"),
@@ -504,7 +409,6 @@ def test_what_is_refused(make, facts):
         (lambda r: vp.VelocityLimitBarrier(r, limits=(1.0, -1.0)), ("VelocityLimitBarrier", "1", "-1")),
         (lambda r: vp.FramePositionCost(r, "tool0", [0.0, 1.0]), ("FramePositionCost reference", "(3,)")),
         (lambda r: vp.FrameOrientationCost(r, "tool0", 2.0 * np.eye(3)), "rotation"),
-        (lambda r: vp.FrameOrientationCost(r, "tool0", 2.0), "rotation"),
         (lambda r: vp.FrameOrientationCost(r, "tool0", np.diag([1.0, 1.0, -1.0])), "rotation"),
         (lambda r: vp.FrameOrientationCost(r, "tool0", np.full((3, 3), np.nan)), "finite"),
         (lambda r: vp.FrameOrientationCost(r, "tool0", np.eye(4)), ("(3, 3)", "(3, 3, 3)")),
@@ -570,19 +474,6 @@ def test_weights_are_copied_and_frozen():
         cost.weight[0] = 2.0
     # Of rank one, with rounding below zero.
     vp.TrackingCost(0.0, a @ a.T)
-
-
-def test_cost_of_refuses_what_is_no_motion_of_the_problem():
-    scene = vp.Scene(vp.planar_chain(2))
-    problem = vp.OptimalControlProblem(scene, vp.ControlCost(), [0, 0], [0, 0], dt=0.1, steps=3)
-    with refused(vp.InputError, "motion", "varpin.Trajectory"):
-        problem.cost_of(np.zeros((4, 2)))
-    other = vp.simulate(vp.Scene(vp.planar_chain(3)), np.zeros(3), np.zeros(3), dt=0.1, steps=3)
-    with refused(vp.InputError, "joints"):
-        problem.cost_of(other)
-    driven = vp.Scene(vp.planar_chain(2), actuation=[[1.0], [0.0]])
-    with refused(vp.InputError, "1", "2", "controls"):
-        problem.cost_of(vp.simulate(driven, [0, 0], [0, 0], dt=0.1, steps=3))
 
 
 def test_costs_print_in_a_line():

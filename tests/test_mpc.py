@@ -1,10 +1,10 @@
-"""Model predictive control: its plans are those of solve, its decisions those of its plans, its times the plant's."""
+"""Model predictive control: plans are those of solve, decisions those of plans, times the plant's."""
 
 import numpy as np
 import pytest
 from findings import about
 from mechanisms import slider
-from plan_problems import CAPSULES, TWO
+from plan_problems import CAPSULES, TWO, swing, wave
 from refusals import naming, refused, unnamed
 
 import varpin as vp
@@ -12,7 +12,6 @@ import varpin.control.mpc
 
 
 def cart(steps=40, **options):
-    """A cart on a spring, which is to be at rest at 0."""
     cost = vp.TrackingCost([0.0], 1.0) + vp.VelocityCost(0.1) + vp.ControlCost(1e-2)
     return vp.OptimalControlProblem(
         vp.Scene(slider(), stiffness=3.0, gravity=False), cost, [1.0], [0.3], dt=0.05, steps=steps, **options
@@ -21,19 +20,6 @@ def cart(steps=40, **options):
 
 def target(t):
     return [0.8 * np.sin(1.5 * t), 0.4]
-
-
-def wave(t):
-    return [0.3 * np.sin(2.0 * t), 0.2 * np.sin(3.0 * t), 0.1 * t]
-
-
-def tracking(integrator=None, **options):
-    robot = vp.planar_chain(3)
-    scene = vp.Scene(robot, damping=0.3)
-    cost = vp.TrackingCost(wave, 1e3) + vp.ControlCost(1e-4) + vp.VelocityCost(1e-2)
-    return vp.OptimalControlProblem(
-        scene, cost, np.zeros(3), np.zeros(3), dt=0.02, steps=20, integrator=integrator, **options
-    )
 
 
 def test_a_linear_system_under_a_quadratic_cost_is_a_linear_feedback():
@@ -55,34 +41,19 @@ def test_a_linear_system_under_a_quadratic_cost_is_a_linear_feedback():
 
 
 def test_what_is_planned_begins_where_the_plant_is():
-    run = vp.Mpc(tracking(t0=0.7)).run(vp.Plant(tracking().scene, substeps=4), duration=0.2)
+    run = vp.Mpc(wave(t0=0.7)).run(vp.Plant(wave().scene, substeps=4), duration=0.8)
     assert len(run.plans) == 10
     ticks = run.motion.q[::4]
     np.testing.assert_allclose(run.planned(0.0)[:-1], ticks[:-1], rtol=0, atol=1e-12)
     for k, plan in enumerate(run.plans):
-        np.testing.assert_allclose(run.planned(0.1)[k], plan.trajectory.q[5], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(run.planned(0.4)[k], plan.trajectory.q[5], rtol=0, atol=1e-12)
         np.testing.assert_allclose(run.planned()[k], plan.trajectory.q[-1], rtol=0, atol=1e-12)
         np.testing.assert_array_equal(run.planned(9.0)[k], plan.trajectory.q[-1])
-    np.testing.assert_allclose(run.planned(0.1)[-1], run.plans[-1].trajectory.q[6], rtol=0, atol=1e-12)
-
-
-def test_references_are_those_of_the_plants_time():
-    problem = tracking(sampling="midpoint")
-    moved = problem.at(t0=0.5)
-    assert moved.t0 == 0.5
-    assert problem.at(t0=0.5).at(steps=10).t0 == 0.5
-    motion = vp.solve(problem, max_iterations=0).trajectory
-    times = 0.5 + (np.arange(20) + 0.5) * 0.02
-    q = 0.5 * (motion.q[1:] + motion.q[:-1])
-    v, u = np.diff(motion.q, axis=0) / 0.02, motion.u
-    own = 1e3 * ((q - np.array([wave(t) for t in times])) ** 2).sum(axis=1)
-    own += 1e-2 * (v**2).sum(axis=1) + 1e-4 * (u**2).sum(axis=1)
-    assert moved.cost_of(motion) == pytest.approx(0.02 * own.sum(), rel=1e-12)
+    np.testing.assert_allclose(run.planned(0.4)[-1], run.plans[-1].trajectory.q[6], rtol=0, atol=1e-12)
 
 
 def test_ctrl_c_ends_a_run_while_it_plans():
-    """A search ends with its best plan, and the run ends with it: without a motion in the first plan."""
-    robot, calls, last = vp.planar_chain(1), [], [np.inf]
+    calls, last = [], [np.inf]
 
     def interrupted(t, q, v, u):
         calls.append(len(t))
@@ -91,20 +62,12 @@ def test_ctrl_c_ends_a_run_while_it_plans():
             raise KeyboardInterrupt
         return (q[:, 0] - 1.0) ** 2
 
-    cost = vp.CustomCost(interrupted, name="goal") + vp.ControlCost(1e-2)
-    problem = vp.OptimalControlProblem(
-        vp.Scene(robot, gravity=False),
-        cost,
-        [0.0],
-        [0.0],
-        dt=0.05,
-        steps=6,
-        constraints=vp.WithinVelocityLimits(robot, (-0.5, 0.5)),
-    )
+    within = vp.WithinVelocityLimits(TWO, (-0.5, 0.5))
+    problem = swing(within, steps=6).at(cost=vp.CustomCost(interrupted, name="goal") + vp.ControlCost(1e-2))
     controller = vp.Mpc(problem, iterations=2)
     last[0] = 4
     with pytest.raises(KeyboardInterrupt) as first:
-        controller.run(duration=0.5)
+        controller.run(duration=0.3)
     assert not isinstance(first.value, vp.Interrupted)
     calls.clear()
 
@@ -113,23 +76,11 @@ def test_ctrl_c_ends_a_run_while_it_plans():
             last[0] = len(calls) + 2
 
     with pytest.raises(vp.Interrupted) as caught:
-        controller.run(duration=0.5, progress=soon)
-    assert caught.value.trajectory.t[-1] == pytest.approx(3 * 0.05)
-
-
-def test_a_plant_that_fails_keeps_the_motion():
-    mpc = vp.Mpc(tracking(), iterations=1)
-    plant = vp.Plant(
-        vp.Scene(mpc.problem.scene.robot, gravity=(0, 0, -1e6)), vp.Midpoint(guard=vp.Guard(max_halvings=0)), 1
-    )
-    with pytest.raises(vp.StepFailure) as caught:
-        mpc.run(plant, duration=1.0)
-    assert caught.value.trajectory.dt == pytest.approx(0.02)
+        controller.run(duration=0.3, progress=soon)
+    assert caught.value.trajectory.t[-1] == pytest.approx(3 * 0.03)
 
 
 def test_a_run_that_ends_early_tells_of_ticks_without_a_plan():
-    """In the warnings of the motion that its error holds: the plant falls out of step, or Ctrl-C."""
-
     def stop(done, _):
         if done == 5:
             raise KeyboardInterrupt
@@ -148,7 +99,6 @@ def test_a_run_that_ends_early_tells_of_ticks_without_a_plan():
 
 @pytest.mark.parametrize("controls", ["held", "linear"])
 def test_a_plan_that_has_no_successor_acts_to_its_end_and_is_held_there(controls):
-    """With the feedback of its last decision, or on its last state; the run tells from when on."""
     usual, done = cart(steps=8), []
 
     def field(q, v, u):
@@ -163,6 +113,8 @@ def test_a_plan_that_has_no_successor_acts_to_its_end_and_is_held_there(controls
         run = mpc.run(vp.Plant(usual.scene), duration=2.0, progress=lambda tick, _: done.append(tick))
         (told,) = about(run.warnings, kind)
         assert "in 39 of 39 ticks" in told
+        assert ((run.late, run.failed)[kind == "failed ticks"] == (np.arange(40) > 0)).all()
+        assert all(plan is run.plans[0] for plan in run.plans)
         assert naming(run.warnings, "whole horizon", "t = 0.4 s")
         policy, motion, end = run.plans[0].policy_on("velocity"), run.motion, run.plans[0].trajectory
         row, reference = 7, policy.reference[7]
@@ -196,7 +148,6 @@ def test_a_cost_that_fails_keeps_the_motion_of_all_ticks_before():
 
 @pytest.mark.parametrize(("slow", "told"), [(20, True), (3, True), (1, False), (0, False)])
 def test_a_controller_that_cannot_keep_up_says_so(slow, told, monkeypatch):
-    """A clock that runs on by 80 ms in some of twenty ticks of 50 ms, by 10 ms in the others."""
     spans = iter([0.08] * slow + [0.01] * (20 - slow))
     now = [0.0, False]
 
@@ -216,31 +167,7 @@ def test_a_controller_that_cannot_keep_up_says_so(slow, told, monkeypatch):
     assert not told or f"in {slow} of 20 ticks ({1e3 * run.seconds[1:].mean():.3g} ms in the mean)" in said[0]
 
 
-def test_mistakes_are_named():
-    problem = tracking()
-    other = vp.Plant(vp.Scene(vp.planar_chain(2)))
-    for make, facts in (
-        (lambda: vp.Mpc("x"), ("problem", "OptimalControlProblem", "str")),
-        (lambda: vp.Mpc(problem, iterations=0), "iterations"),
-        (lambda: vp.Mpc(problem, budget=-1.0), "budget"),
-        (lambda: vp.Mpc(problem).run(other, duration=1.0), "joints"),
-        (lambda: vp.Mpc(problem).run(duration=0.04).planned(-0.1), ("ahead", "0")),
-        (lambda: vp.Mpc(problem).run(duration=0.04).planned(np.nan), ("ahead", "0")),
-        (lambda: vp.Mpc(problem).run(duration=0.0), "duration"),
-        (lambda: vp.Mpc(problem).run(problem.scene, duration=0.1), ("plant", "varpin.Plant")),
-        (lambda: vp.Mpc(problem).run(duration=0.1, rng="a"), "rng"),
-        (lambda: vp.Mpc(problem).plan(0.0, [0.0], np.zeros(3)), "q0"),
-        (lambda: vp.Mpc(problem).plan(0.05, np.zeros(3), np.zeros(3), 3), ("previous", "int")),
-        (lambda: vp.Mpc(problem).plan(0.05, np.zeros(3), np.zeros(3), None, -1), ("decisions", "-1")),
-        (lambda: vp.Plant(problem.scene, "rk"), "integrator"),
-        (lambda: vp.solve(problem, time_limit=0.0), "time_limit"),
-    ):
-        with refused(vp.InputError, facts):
-            make()
-
-
 def test_what_plan_and_motion_have_in_common_is_told_once():
-    """Joints beyond their limits of velocity, which the first plan means to pass, are told of the motion alone."""
     robot = vp.load_robot("ur5")
     cost = vp.VelocityCost(1e-3) + vp.ControlCost(1e-5) + vp.TrackingCost(lambda t: np.full(6, 20.0 * t**2), 10.0)
     problem = vp.OptimalControlProblem(
@@ -268,7 +195,6 @@ def test_what_plan_and_motion_have_in_common_is_told_once():
     ids=["path", "rows", "custom", "frame", "turn"],
 )
 def test_a_problem_at_another_time_and_state_is_that_of_its_grid(cost):
-    """Costs that no time changes are not bound again, and the values are the same to the last bit."""
     cost = vp.ControlCost(0.1) + cost
     scene, grid = vp.Scene(vp.planar_chain(2)), {"dt": 0.05, "steps": 20, "control_limits": (-3.0, 4.0)}
     made = vp.OptimalControlProblem(scene, cost, [0.1, 0.2], [0.3, 0.4], t0=0.7, **grid)
@@ -287,11 +213,10 @@ def test_a_problem_at_another_time_and_state_is_that_of_its_grid(cost):
 
 
 def test_a_shifted_plan_of_linear_controls_is_the_rest_of_it():
-    """Along the plan the shifted policy repeats its controls, and holds the last one beyond its end."""
-    plan = vp.solve(tracking(controls="linear").at(steps=8), tolerance=1e-10, check=False)
+    plan = vp.solve(wave(controls="linear", steps=8), tolerance=1e-10, check=False)
     motion, N = plan.trajectory, 8
     for by in (0, 3, N):
-        at = {"q0": motion.q[by], "v0": motion.v[by], "t0": by * 0.02}
+        at = {"q0": motion.q[by], "v0": motion.v[by], "t0": by * 0.08}
         again = plan.problem.at(**at).simulate(plan.shifted(by))
         np.testing.assert_allclose(again.u_nodes[: N + 1 - by], plan.controls[by:], rtol=0, atol=1e-8)
         np.testing.assert_allclose(again.q[: N + 1 - by], motion.q[by:], rtol=0, atol=1e-11)
@@ -305,29 +230,27 @@ def test_a_shifted_plan_of_linear_controls_is_the_rest_of_it():
 
 @pytest.mark.parametrize("rate", [False, True])
 def test_a_tick_with_linear_controls_is_its_problem_solved_anew(rate):
-    """Measured elsewhere than planned: enough iterations from the shifted plan end where a search from nothing does."""
-    problem = tracking(controls="linear", control_limits=(-15.0, 15.0)).at(steps=8)
+    problem = wave(controls="linear", control_limits=(-15.0, 15.0), steps=8)
     if rate:
         problem = problem.at(cost=problem.cost + vp.ControlRateCost(1e-6), control_limits=(-np.inf, np.inf))
     mpc = vp.Mpc(problem, iterations=50, tolerance=1e-13)
     first = mpc.plan(0.0, problem.q0, problem.v0)
     q, v = first.trajectory.q[1] + 0.01, first.trajectory.v[1] - 0.02
-    tick = mpc.plan(0.02, q, v, previous=first)
+    tick = mpc.plan(0.08, q, v, previous=first)
     before = first.controls[1] if rate else None
-    anew = vp.solve(problem.at(q0=q, v0=v, t0=0.02, before=before), tolerance=1e-13, check=False)
+    anew = vp.solve(problem.at(q0=q, v0=v, t0=0.08, before=before), tolerance=1e-13, check=False)
     assert tick.status.converged
     # Costs agree to the tenth digit: controls to the fifth of theirs.
     np.testing.assert_allclose(tick.controls, anew.controls, rtol=0, atol=1e-5 * 15.0)
     assert tick.cost == pytest.approx(anew.cost, rel=1e-10)
     # One iteration has one backward pass, and leaves a part of what the shifted plan has too much.
     start = vp.solve(anew.problem, first.shifted(1, before), max_iterations=0, check=False)
-    quick = vp.Mpc(problem, iterations=1).plan(0.02, q, v, previous=first)
+    quick = vp.Mpc(problem, iterations=1).plan(0.08, q, v, previous=first)
     assert sum(item.backward_passes for item in quick.history) == quick.iterations == 1
     assert anew.cost < quick.cost < anew.cost + 0.2 * (start.cost - anew.cost)
 
 
 def test_a_fault_of_the_plant_is_logged_once(caplog):
-    """Of the whole run, not of its first tick as well."""
     robot = vp.planar_chain(2)
     plain, rough = (vp.Scene(robot, gravity=False, friction=level) for level in (0.0, 0.5))
     cost = vp.ControlCost(1e-2) + vp.Terminal(vp.TrackingCost([0.6, -0.4], 1e3) + vp.VelocityCost(10.0))
@@ -367,39 +290,29 @@ def bob(t):
 
 def bounded(constraints, **options):
     cost = vp.TrackingCost(target, 100.0) + vp.ControlCost(1e-4) + vp.VelocityCost(1e-2)
-    return vp.OptimalControlProblem(
-        vp.Scene(TWO, damping=0.3),
-        cost,
-        [0.0, 0.4],
-        [0.0, 0.0],
-        dt=0.03,
-        steps=16,
-        constraints=constraints,
-        **options,
-    )
+    given = {"dt": 0.03, "steps": 16, "constraints": constraints, **options}
+    return vp.OptimalControlProblem(vp.Scene(TWO, damping=0.3), cost, [0.0, 0.4], [0.0, 0.0], **given)
 
 
 SPEEDS = [vp.WithinVelocityLimits(TWO, (-0.8, 0.8))]
-MOVING = [
-    vp.KeepOutOfSphere(TWO, "tip", bob, 0.3),
-    vp.KeepClear(TWO, [vp.Obstacle.sphere(bob(0), 0.2).moving(lambda t: bob(t) - np.array(bob(0)))], 0.02,
-                 capsules=CAPSULES),
-]  # fmt: skip
+
+
+def round_things(time, swinging):
+    center = bob if swinging else bob(time)
+    ball = vp.Obstacle.sphere(bob(0.0 if swinging else time), 0.2)
+    ball = ball.moving(lambda t: bob(t) - np.array(bob(0.0))) if swinging else ball
+    return [vp.KeepOutOfSphere(TWO, "tip", center, 0.3), vp.KeepClear(TWO, [ball], 0.02, capsules=CAPSULES)]
 
 
 def test_obstacles_are_where_they_are_at_each_time():
-    """Bounds of an obstacle and a sphere that move are those of ones that stand there, at every node."""
-    problem = bounded(MOVING, t0=0.4)
+    problem = bounded(round_things(0.0, True), t0=0.4)
     rng = np.random.default_rng(0)
     q = rng.normal(size=(17, 2))
     sphere, ball = (bound.value(q, q, q[1:]) for bound in problem.bound_constraints)
     slopes = [bound.jacobian(q, q) for bound in problem.bound_constraints]
     for k, t in enumerate(0.4 + 0.03 * np.arange(1, 17)):
-        still = [
-            vp.KeepOutOfSphere(TWO, "tip", bob(t), 0.3),
-            vp.KeepClear(TWO, [vp.Obstacle.sphere(bob(t), 0.2)], 0.02, capsules=CAPSULES),
-        ]
-        for moving, there, slope in zip((sphere, ball), bounded(still).bound_constraints, slopes, strict=True):
+        still = bounded(round_things(t, False)).bound_constraints
+        for moving, there, slope in zip((sphere, ball), still, slopes, strict=True):
             np.testing.assert_allclose(moving[k], there.value(q, q, q[1:])[k], rtol=0, atol=1e-12)
             np.testing.assert_allclose(slope[k], there.jacobian(q, q)[k], rtol=0, atol=1e-12)
     # Several motions at once, as a line search has them.
@@ -407,21 +320,7 @@ def test_obstacles_are_where_they_are_at_each_time():
     np.testing.assert_array_equal(both[0], ball)
 
 
-def test_ways_of_obstacles_are_checked():
-    ball = vp.Obstacle.sphere([1.0, 0.0, 0.0], 0.1, name="ball")
-    with refused(vp.InputError, "function"):
-        ball.moving([0.0, 0.0, 1.0])
-    moving = ball.moving(lambda t: [0.0, 0.0])
-    with refused(vp.InputError, "moves already"):
-        moving.moving(lambda t: [0.0, 0.0, 0.0])
-    with refused(vp.InputError, "'ball'", "0.03"):
-        bounded([vp.KeepClear(TWO, [moving], capsules=CAPSULES)])
-    with refused(vp.InputError, "center", "finite"):
-        bounded([vp.KeepOutOfSphere(TWO, "tip", lambda t: [np.nan, 0.0, 0.0], 0.1)])
-
-
 def test_ticks_that_find_no_plan_are_told_of():
-    """A goal that no horizon reaches: multipliers stay bounded, and the goal is kept again once it can be."""
     far = vp.Mpc(bounded([vp.ReachFrame(TWO, "tip", position=[2.2, 0.0, 0.0])])).run(duration=0.3)
     assert far.infeasible.sum() > 3
     assert naming(far.warnings, "no plan", "ReachFrame('tip')")
@@ -432,27 +331,11 @@ def test_ticks_that_find_no_plan_are_told_of():
 
 
 def test_what_the_plant_violates_is_told_of():
-    """A plant that is pushed harder than the model knows; the same seed pushes alike."""
     noisy = vp.Plant(vp.Scene(TWO, damping=0.3, noise=vp.AdditiveNoise(0.1)))
     run, again = (vp.Mpc(bounded(SPEEDS)).run(noisy, duration=0.6, rng=1) for _ in range(2))
     np.testing.assert_array_equal(run.motion.q, again.motion.q)
     assert 0.05 < run.constraints[0].violation < 0.4
     assert naming(run.warnings, "motion violates", "WithinVelocityLimits", "margin=", "narrower")
-
-
-@pytest.mark.parametrize("iterations", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_loops_of_linear_controls_do_not_run_away(iterations):
-    """Speeds of plans and of the plant, and its violations."""
-    fastest, costs = {}, {}
-    for controls in ("held", "linear"):
-        run = vp.Mpc(bounded(SPEEDS, controls=controls), iterations=iterations).run(duration=1.5)
-        plans = max(np.abs(plan.trajectory.v).max() for plan in run.plans)
-        fastest[controls] = max(plans, np.abs(run.motion.v).max())
-        costs[controls] = np.mean([plan.cost for plan in run.plans])
-        assert run.constraints[0].violation <= 1e-2
-        assert max(item.rollouts for plan in run.plans[1:] for item in plan.history) <= 8
-    assert fastest["linear"] <= 1.4 * fastest["held"]
-    assert costs["linear"] <= 1.4 * costs["held"]
 
 
 def test_plans_of_ticks_are_saved_with_their_rows(tmp_path):
@@ -470,7 +353,7 @@ def test_plans_of_ticks_are_saved_with_their_rows(tmp_path):
 
 
 def test_ticks_within_speeds_are_close_to_their_optimum():
-    """Of a UR3 most of whose joints are at their limits all the time, with one iteration a tick and with three."""
+    """Of a UR3 most of whose joints are at their limits all the time."""
     robot, begin = vp.load_robot("ur3"), np.array([0.0, -1.2, 1.2, -0.5, -1.0, 0.0])
     scene = vp.Scene(robot, damping=0.1)
     cost = vp.TrackingCost(lambda t: begin + 0.35 * np.sin(2.0 * t) * np.cos(np.arange(6)), 100.0)
@@ -485,7 +368,6 @@ def test_ticks_within_speeds_are_close_to_their_optimum():
 
 
 def test_between_nodes_ticks_keep_to_the_middles_of_long_steps():
-    """Held controls, whose plans keep to the sphere at the nodes alone without it."""
     sphere, found = vp.KeepOutOfSphere(TWO, "tip", [1.6, 0.0, -1.2], 0.25), {}
     for between in (False, True):
         problem = bounded([sphere], between_nodes=between).at(dt=0.06, steps=8)

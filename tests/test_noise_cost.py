@@ -1,111 +1,114 @@
-"""What noise costs a plan, against the exact covariance in continuous time; and the warning where steps are long."""
+"""What noise costs a plan: exact values, paths, fine steps, lines, and the warning of long steps."""
+
+import dataclasses
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from findings import about
-from scipy.linalg import expm
+from oracles import lines
+from plan_problems import linear
 
 import varpin as vp
-from varpin.control.noise import noise_cost
+from varpin.control.noise import left_within_steps, noise_cost
 from varpin.control.stages import Feedback, Steps
+from varpin.integrators.base import diffusion_and_drift
 
-LEVEL, DAMPING = 0.3, 1.5
-WEIGHTS = {"q": 5.0, "v": 1.0, "u": 0.05}
-
-
-def plan(dt: float, hold: int = 1, **options: object) -> vp.Solution:
-    """One joint without gravity, held at rest: the noise cost is the whole cost."""
-    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=DAMPING, noise=vp.AdditiveNoise(LEVEL))
-    cost = vp.TrackingCost([0.0], WEIGHTS["q"]) + vp.VelocityCost(WEIGHTS["v"]) + vp.ControlCost(WEIGHTS["u"])
-    problem = vp.OptimalControlProblem(
-        scene,
-        cost + vp.Terminal(vp.VelocityCost(0.1)),
-        [0.0],
-        [0.0],
-        dt=dt,
-        steps=round(1.0 / dt),
-        hold=hold,
-        **options,
-    )
-    return vp.solve(problem)
+CONTROL, STATE = vp.ControlNoise(0.3), vp.StateNoise(3.0, center=np.zeros(2))
+SLIDING = vp.CustomNoise(
+    lambda q, v, u: np.array([[0.2 * v[0] + 0.1 * u[1]], [0.3 + 0.1 * v[1]]]),
+    1,
+    dv=lambda q, v, u: np.array([[[0.2, 0.0]], [[0.0, 0.1]]]),
+    du=lambda q, v, u: np.array([[[0.0, 0.1]], [[0.0, 0.0]]]),
+)
 
 
-def exact(solution: vp.Solution) -> float:
-    """E[cost] from the moments of (q, v, u), whose equations are linear, by the matrix exponential."""
-    model = solution.problem.scene.robot.model
-    inertia = pin.crba(model, model.createData(), pin.neutral(model))[0, 0]
-    A = np.array([[0.0, 1.0, 0.0], [0.0, -DAMPING / inertia, 1.0 / inertia], [0.0, 0.0, 0.0]])
-    kick = np.diag([0.0, (LEVEL / inertia) ** 2, 0.0])
-    rates = np.zeros((11, 11))
-    rates[:9, :9] = np.kron(A, np.eye(3)) + np.kron(np.eye(3), A)
-    rates[:9, 10] = kick.ravel()
-    rates[9, :9] = np.diag(list(WEIGHTS.values())).ravel()
-    interval = expm(rates * solution.problem.dt * solution.problem.hold)
-    S, total = np.zeros((3, 3)), 0.0
-    for gain in solution.gains[:, 0]:
-        decide = np.eye(3)
-        decide[2] = gain[0], gain[1] * inertia, 0.0
-        S = decide @ S @ decide.T
-        end = interval @ np.concatenate([S.ravel(), [0.0, 1.0]])
-        S, total = end[:9].reshape(3, 3), total + end[9]
-    return total + 0.1 * S[1, 1]
+def reach(noise, **options):
+    cost = vp.ControlCost(0.05) + vp.VelocityCost(0.1)
+    cost += vp.Terminal(vp.TrackingCost([0.5, -0.5], 20.0) + vp.VelocityCost(5.0))
+    scene = vp.Scene(vp.planar_chain(2), damping=0.2, noise=noise)
+    given = {"dt": 0.08, "steps": 5, **options}
+    return vp.OptimalControlProblem(scene, cost, np.full(2, 0.2), np.zeros(2), **given)
 
 
+def of(solution):
+    return Steps(solution.problem, solution.trajectory), Feedback(solution.gains, solution.previous_gains)
+
+
+@pytest.mark.parametrize(
+    ("more", "options"),
+    [
+        (None, {"hold": 2, "integrator": vp.Gauss(2)}),
+        (None, {"hold": 3, "integrator": vp.RungeKutta4(), "sampling": "start"}),
+        (vp.ControlRateCost(1e-2), {"hold": 2, "integrator": vp.Midpoint(kick="split")}),
+        (None, {"controls": "linear", "integrator": vp.Gauss(2, kick="split")}),
+        (vp.ControlRateCost(1e-2), {"controls": "linear", "integrator": vp.Gauss(2)}),
+    ],
+    ids=["held", "explicit", "changes of controls", "linear", "linear, changes of controls"],
+)
+def test_it_is_that_of_each_impulse(more, options):
+    """Of a linear system the cost is quadratic in the increments."""
+    plan = vp.solve(linear(more, noise=vp.AdditiveNoise(0.3), **options), check=False)
+    problem, expected = plan.problem, 0.0
+
+    def cost(w):
+        return problem.cost_of(problem.simulate(plan.policy, increments=w.reshape(problem.steps, 2)))
+
+    least = cost(np.zeros(2 * problem.steps))
+    for w in np.eye(2 * problem.steps):
+        expected += problem.dt * 0.5 * (cost(w) + cost(-w) - 2.0 * least)
+    assert plan.noise_cost == pytest.approx(expected, rel=1e-8)
+
+
+@pytest.mark.parametrize("noise", [vp.AdditiveNoise(0.3), CONTROL + STATE, SLIDING], ids=["white", "core", "python"])
 @pytest.mark.parametrize("kick", ["left", "split", "held"])
-@pytest.mark.parametrize("noise", [vp.AdditiveNoise(0.3), vp.ControlNoise(0.2) + vp.StateNoise(0.5, center=[0.1, 0.1])])
-def test_it_is_that_of_the_backward_pass(noise, kick):
-    scene = vp.Scene(vp.planar_chain(2), damping=0.4, noise=noise)
-    cost = vp.TrackingCost([0.5, 0.2], 5.0) + vp.VelocityCost(0.3) + vp.ControlCost(0.01)
-    problem = vp.OptimalControlProblem(
-        scene, cost + vp.Terminal(vp.VelocityCost(1.0)), [0.2, 0.1], [0.0, 0.0], dt=0.05, steps=12, hold=2,
-        integrator=vp.Gauss(2, kick=kick),
-    )  # fmt: skip
-    found = vp.solve(problem, check=False)
-    own = noise_cost(Steps(problem, found.trajectory), Feedback(found.gains, found.previous_gains))
-    assert own == pytest.approx(found.noise_cost, rel=1e-9)
+@pytest.mark.parametrize("options", [{"hold": 2}, {"controls": "linear"}], ids=["held", "linear"])
+def test_forward_and_backward_it_is_the_same(options, kick, noise):
+    problem = reach(noise, integrator=vp.Gauss(2, kick=kick), steps=6, **options)
+    u = np.random.default_rng(1).normal(size=(problem.decisions, 2))
+    plan = vp.solve(problem, u, max_iterations=0, check=False)
+    assert noise_cost(*of(plan)) == pytest.approx(plan.noise_cost, rel=1e-9)
 
 
-def test_costs_of_velocities_are_close_in_long_steps_too():
-    """Of the default, without and with control noise; monte_carlo has the same share within steps."""
-    long = plan(0.1)
-    assert long.noise_cost == pytest.approx(exact(long), rel=0.05)
-    assert not about(long.warnings, "noise within steps")
-    estimate = long.monte_carlo(400, rng=0)
-    assert abs(estimate.cost - estimate.predicted) < 4.0 * estimate.standard_error
+@pytest.mark.parametrize("integrator", [vp.Gauss(2, kick="held"), vp.RungeKutta4()], ids=["core", "python"])
+def test_paths_cost_what_the_plan_expects(integrator):
+    """Path by path, with what no path shows; on average the table of plans has it."""
+    plan = vp.solve(reach(SLIDING, integrator=integrator, controls="linear"), check=False)
+    again = [
+        plan.problem.cost_of(plan.problem.simulate(plan.policy, rng=child))
+        for child in np.random.default_rng(0).spawn(2)
+    ]
+    within = left_within_steps(*of(plan))
+    assert (within > 0.0) == integrator.holds_noise
+    assert plan.monte_carlo(2, rng=0).cost == pytest.approx(np.mean(again) + within, rel=1e-12)
 
 
-def test_a_plan_whose_steps_are_long_for_the_noise_says_so():
-    """With the paper's impulse."""
-    long = plan(0.1, integrator=vp.Gauss(4))
-    assert abs(long.noise_cost / exact(long) - 1.0) > 0.15
-    (sentence,) = about(long.warnings, "noise within steps")
-    halves = float(sentence.split()[2])
-    assert abs(halves - exact(long)) < 0.6 * abs(long.noise_cost - exact(long))
-    assert "problem.at(dt=0.05, hold=2) is closer" in sentence
-    # Whether paths agree with the linear model is not known without them.
-    assert "agrees" not in sentence
+def in_parts(plan, parts=16):
+    problem, held = plan.problem, np.repeat(plan.trajectory.u, parts, axis=0)
+    fine = problem.at(dt=problem.dt / parts, hold=parts * problem.hold)
+    return noise_cost(Steps(fine, fine.simulate(held)), of(plan)[1])
 
 
-@pytest.mark.parametrize("damping", [0.0, 2.0, 20.0])
-def test_in_the_long_steps_of_a_plan_it_is_close_to_that_of_fine_steps(damping):
-    """The default's, of position costs; an impulse before each step costs half as much again and more."""
-    noise = vp.AdditiveNoise(0.1) + vp.ControlNoise(0.05)
-    scene = vp.Scene(vp.planar_chain(2), gravity=False, damping=damping, stiffness=5.0, noise=noise)
-    cost = vp.TrackingCost([0.5, 0.2], 10.0) + vp.ControlCost(1e-2)
-    found = vp.solve(vp.OptimalControlProblem(scene, cost, [0.3, 0.1], [0.0, 0.0], dt=0.04, steps=25), check=False)
-    feedback = Feedback(found.gains, found.previous_gains)
-    fine = found.problem.at(dt=0.04 / 16, hold=16)
-    there = noise_cost(Steps(fine, fine.simulate(np.repeat(found.trajectory.u, 16, axis=0))), feedback)
-    assert found.problem.integrator.kick == "held"
-    assert found.noise_cost == pytest.approx(there, rel=0.05)
-    left = found.problem.at(integrator=type(found.problem.integrator)(stages=4))
-    assert noise_cost(Steps(left, left.simulate(found.trajectory.u)), feedback) > 1.02 * there
+@pytest.mark.parametrize("integrator", [None, vp.Gauss(4)], ids=["default", "impulses"])
+def test_long_steps(integrator):
+    """Of an impulse before each step, the paper's, a warning says what is closer."""
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=1.5, noise=vp.AdditiveNoise(0.3))
+    cost = vp.TrackingCost([0.0], 5.0) + vp.VelocityCost(1.0) + vp.ControlCost(0.05)
+    cost += vp.Terminal(vp.VelocityCost(0.1))
+    plan = vp.solve(vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=0.1, steps=10, integrator=integrator))
+    exact, told = in_parts(plan), about(plan.warnings, "noise within steps")
+    assert bool(told) == (integrator is not None)
+    if not told:
+        assert plan.noise_cost == pytest.approx(exact, rel=0.05)
+        estimate = plan.monte_carlo(400, rng=0)
+        assert abs(estimate.cost - estimate.predicted) < 4.0 * estimate.standard_error
+        return
+    assert abs(plan.noise_cost / exact - 1.0) > 0.15
+    assert abs(float(told[0].split()[2]) - exact) < 0.6 * abs(plan.noise_cost - exact)
+    assert "problem.at(dt=0.05, hold=2) is closer" in told[0]
 
 
 @pytest.mark.parametrize(("strength", "told"), [(5e-4, True), (5e-5, False)])
 def test_feedback_as_fast_as_the_steps_is_told_of_where_noise_matters(strength, told):
-    """The rest of the noise, beside its mean over a step, costs a fifth of it; a small part of the expected cost."""
     scene = vp.Scene(vp.load_robot("finger"), noise=vp.ControlNoise(strength))
 
     def reference(t):
@@ -116,7 +119,7 @@ def test_feedback_as_fast_as_the_steps_is_told_of_where_noise_matters(strength, 
     found = vp.solve(vp.OptimalControlProblem(scene, cost, **start, dt=4e-3, steps=50))
     in_halves = found.problem.at(dt=2e-3, hold=2, integrator=found.problem.integrator)
     finer = in_halves.simulate(found.policy_on("momentum", 2))
-    halves = noise_cost(Steps(in_halves, finer), Feedback(found.gains, found.previous_gains))
+    halves = noise_cost(Steps(in_halves, finer), of(found)[1])
     assert abs(halves - found.noise_cost) > 0.1 * halves
     assert abs(halves - found.noise_cost) < 0.05 * (found.cost + halves)
     assert (halves > 0.01 * (found.cost + halves)) == told
@@ -124,7 +127,6 @@ def test_feedback_as_fast_as_the_steps_is_told_of_where_noise_matters(strength, 
 
 
 def test_steps_in_which_noise_grows_without_bound_have_no_cost(recwarn):
-    """As those of a force that drives: no warning of NumPy, and an error that rejects the trial."""
     cost = vp.VelocityCost(1.0) + vp.ControlCost(1.0)
 
     def problem(*forces):
@@ -146,25 +148,25 @@ def test_steps_in_which_noise_grows_without_bound_have_no_cost(recwarn):
 def test_in_fast_motions_of_arms_it_is_that_of_fine_steps(damping):
     """A Panda at 2.5 rad/s turns by 0.1 rad in a step: its inertias change, and with them momenta."""
     robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.02})
-    begin, goal = np.array([0.4, -0.3, 0.2, -1.2, 0.1, 1.0, 0.3]), np.array([0.9, 0.2, -0.3, -0.8, 0.6, 1.4, -0.1])
+    begin, goal = (
+        np.array([0.4, -0.3, 0.2, -1.2, 0.1, 1.0, 0.3]),
+        np.array([0.9, 0.2, -0.3, -0.8, 0.6, 1.4, -0.1]),
+    )
     cost = vp.ControlCost(1e-2) + vp.VelocityCost(1.0) + vp.Terminal(vp.TrackingCost(goal, 10.0))
 
     def problem(noise):
         scene = vp.Scene(robot, damping=damping, noise=noise)
         return vp.OptimalControlProblem(scene, cost, begin, np.zeros(7), dt=0.05, steps=12)
 
-    plan = vp.solve(problem(None), check=False)
-    noisy, feedback = problem(vp.ControlNoise(0.05)), Feedback(plan.gains, plan.previous_gains)
-    fine = noisy.at(dt=0.05 / 16, hold=16)
-    there = noise_cost(Steps(fine, fine.simulate(np.repeat(plan.controls, 16, axis=0))), feedback)
-    assert noisy.integrator.kick == "held"
-    assert noise_cost(Steps(noisy, plan.trajectory), feedback) == pytest.approx(there, rel=0.05)
+    plan = dataclasses.replace(vp.solve(problem(None), check=False), problem=problem(vp.ControlNoise(0.05)))
+    assert plan.problem.integrator.kick == "held"
+    assert noise_cost(*of(plan)) == pytest.approx(in_parts(plan), rel=0.05)
 
 
 @pytest.mark.parametrize("integrator", [None, vp.Gauss(2, kick="held"), vp.Radau(3, kick="held")])
 @pytest.mark.parametrize("damping", [0.0, 0.05, 1.5, 30.0])
 def test_what_velocities_cost_in_a_step_from_rest(damping, integrator):
-    """The exact variance of white noise over a step: its mean within the step, and at the end of the last one."""
+    """The exact variance of white noise, its mean over the step and at its end."""
     level, dt = 0.3, 0.1
     scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=damping, noise=vp.AdditiveNoise(level))
     inertia = vp.lagrangian_jet(scene, [0.0], [0.0]).Lvv[0, 0]
@@ -176,3 +178,109 @@ def test_what_velocities_cost_in_a_step_from_rest(damping, integrator):
         problem = vp.OptimalControlProblem(scene, vp.ControlCost(1.0) + cost, [0.0], [0.0], **given)
         found = noise_cost(Steps(problem, problem.simulate(np.zeros((1, 1)))), Feedback(np.zeros((1, 1, 2)), None))
         assert found == pytest.approx((level / inertia) ** 2 * exact, rel=1e-5)
+
+
+# --- along lines ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("noise", [CONTROL + STATE, SLIDING], ids=["core", "python"])
+@pytest.mark.parametrize("kick", ["left", "split", "held"])
+def test_the_effect_of_noise_along_a_line(noise, kick):
+    integrator = vp.Gauss(2, kick=kick)
+    problem = reach(noise, steps=1, integrator=integrator, controls="linear").at(q0=[0.3, -0.2], v0=[0.4, 0.7])
+    scene, n, left = problem.scene, 2, integrator.left
+    at, size = np.array([1.0, -2.0, 3.0, 0.5]), 1e-4
+    motion = problem.simulate(lines(problem, at.reshape(2, 2)))
+    lin = vp.linearize(scene, motion)
+
+    def effect(ends):
+        moved = problem.simulate(lines(problem, ends.reshape(2, 2)))
+
+        def fields(k, u):
+            return scene.noise.fields(moved.q[k, None], moved.v[k, None], u[None], problem.q0).F[0]
+
+        def columns(k):
+            slope = (fields(k, ends[2:]) - fields(k, ends[:2])) / np.sqrt(12.0)
+            # Noise of the state's alone sees no slope.
+            return np.hstack([fields(k, 0.5 * (ends[:2] + ends[2:])), slope[:, np.abs(slope).any(axis=0)]])
+
+        before, after = columns(0), columns(1)
+        found = left * lin.J[0] @ before
+        found[n:] += (1.0 - left) * after
+        return found
+
+    np.testing.assert_allclose(lin.G[0], effect(at), atol=1e-12)
+    derivatives = np.concatenate([lin.Gu - lin.Gramp, lin.Gramp], axis=3)[0]
+    for c, away in enumerate(size * np.eye(4)):
+        found = (effect(at + away) - effect(at - away)) / (2.0 * size)
+        np.testing.assert_allclose(derivatives[:, :, c], found, atol=1e-8)
+
+
+def test_strong_noise_costs_what_the_plan_expects_in_fine_steps():
+    """Controls that alternate do not escape it."""
+    problem = reach(vp.ControlNoise(1.0), steps=10, controls="linear")
+    plan = vp.solve(problem)
+    assert plan.status is vp.Status.CONVERGED
+    assert not about(plan.warnings, "noise within steps")
+    fine = problem.at(dt=problem.dt / 4)
+    given = {"dt": fine.dt, "steps": fine.steps, "controls": plan.policy, "integrator": problem.integrator}
+    paths = [
+        vp.simulate(problem.scene, problem.q0, problem.v0, rng=child, check=False, **given)
+        for child in np.random.default_rng(3).spawn(200)
+    ]
+    costs = np.array([fine.cost_of(path) for path in paths])
+    assert abs(costs.mean() - plan.expected_cost) < 3.0 * costs.std(ddof=1) / np.sqrt(len(costs))
+
+
+@pytest.mark.parametrize(
+    ("kick", "constrained"), [("left", False), ("split", False), ("held", False), ("left", True), ("held", True)]
+)
+def test_paths_on_lines_are_repeated_and_examined_with_their_noise(kick, constrained):
+    noise = vp.ControlNoise(0.05) + vp.AdditiveNoise(0.01)
+    limits = [vp.JointTie("joint2", "joint1")] if constrained else []
+    scene = vp.Scene(vp.planar_chain(2), damping=0.2, noise=noise, constraints=limits)
+    integrator = vp.Gauss(2, kick=kick)
+    controls = vp.FirstOrderHold(20.0 * np.sin(np.linspace(0.0, 60.0, 201))[:, None] * [1.0, -0.5])
+    given = {"dt": 2e-3, "steps": 200, "controls": controls, "integrator": integrator}
+    motion = vp.simulate(scene, [0.2, 0.2], [0.0, 0.0], rng=1, **given)
+    assert motion.dw.shape == (200, 6)
+    unknown = ["error"] if constrained and kick == "left" else []  # the repetition cannot have its noise
+    assert [finding.kind for finding in motion.warnings] == unknown
+    again = vp.simulate(scene, [0.2, 0.2], [0.0, 0.0], increments=motion.dw, **given)
+    np.testing.assert_array_equal(again.q, motion.q)
+    # Without those of slopes these are zero.
+    means = vp.simulate(scene, [0.2, 0.2], [0.0, 0.0], increments=motion.dw[:, :4], **given)
+    zeros = np.hstack([motion.dw[:, :4], np.zeros((200, 2))])
+    np.testing.assert_array_equal(means.q, vp.simulate(scene, [0.2, 0.2], [0.0, 0.0], increments=zeros, **given).q)
+    assert np.abs(means.q - motion.q).max() > 1e-6
+
+
+@pytest.mark.parametrize("integrator", [vp.Gauss(2), vp.Gauss(2, kick="held"), vp.RungeKutta4()], ids=str)
+def test_the_drift_along_a_line_is_its_mean_over_the_step(integrator):
+    sliding = vp.CustomNoise(
+        lambda q, v, u: np.array([[0.2 * v[0] + 0.1 * u[1]], [0.3 + 0.1 * u[0] * v[1]]]),
+        1,
+        dv=lambda q, v, u: np.array([[[0.2, 0.0]], [[0.0, 0.1 * u[0]]]]),
+        du=lambda q, v, u: np.array([[[0.0, 0.1]], [[0.1 * v[1], 0.0]]]),
+        check=True,
+    )
+    problem = reach(sliding, steps=1, integrator=integrator, controls="linear").at(q0=[0.3, -0.2], v0=[0.4, 0.7])
+    scene, u = problem.scene, np.array([1.0, -2.0, -3.0, 4.0])
+
+    def ends(x, u):
+        at = problem.at(q0=x[:2], v0=x[2:])
+        motion = at.simulate(lines(at, u.reshape(2, 2)))
+        return np.concatenate([motion.q[1], motion.p[1] if integrator.variational else motion.v[1]])
+
+    def local(control):
+        return diffusion_and_drift(scene, problem.q0, problem.v0, control, problem.q0)[1]
+
+    mean = 0.5 * (u[:2] + u[2:])
+    found = diffusion_and_drift(scene, problem.q0, problem.v0, mean, problem.q0, (u[None, :2], u[None, 2:]))[1]
+    np.testing.assert_allclose(found, (local(u[:2]) + 4.0 * local(mean) + local(u[2:])) / 6.0, atol=1e-14)
+    assert np.abs(found - local(mean)).max() > 1e-2
+    lin = vp.linearize(scene, problem.simulate(lines(problem, u.reshape(2, 2))))
+    x, step = np.concatenate([problem.q0, problem.v0]), 1e-5
+    by_control = np.concatenate([lin.B - lin.ramp, lin.ramp], axis=2)[0]
+    for c, away in enumerate(step * np.eye(4)):
+        np.testing.assert_allclose(by_control[:, c], (ends(x, u + away) - ends(x, u - away)) / (2 * step), atol=1e-8)

@@ -7,6 +7,7 @@ import logging
 import numpy as np
 import pytest
 from findings import about
+from plan_problems import swing
 from refusals import refused
 
 import varpin as vp
@@ -50,26 +51,18 @@ def test_no_increments_are_the_motion_without_noise():
         vp.simulate(noisy(), [0.1, 0.2], [0, 0], **SHORT, increments=1.0)
 
 
-def test_a_seed_of_nothing_is_told_of():
-    warnings = vp.simulate(QUIET, [0, 0], [0, 0], **SHORT, rng=0).warnings
-    assert len(warnings) == len(about(warnings, "nothing random")) == 1
-
-
-def test_paths_that_are_all_one_are_told_of():
-    same = vp.simulate_ensemble(QUIET, [0, 0], [0, 0], **SHORT, paths=3, rng=0)
-    assert about(same.warnings, "paths alike")
+def test_paths_that_are_all_one_and_seeds_of_nothing_are_told_of():
+    alone = vp.simulate(QUIET, [0, 0], [0, 0], **SHORT, rng=0).warnings
+    assert len(alone) == len(about(alone, "nothing random")) == 1
     starts = [[0.0, 0.0], [0.1, 0.0], [0.2, 0.0]]
-    for apart in (
-        vp.simulate_ensemble(QUIET, starts, [0, 0], **SHORT, paths=3, rng=0),
-        vp.simulate_ensemble(noisy(), [0, 0], [0, 0], **SHORT, paths=3, rng=0),
-        vp.simulate_ensemble(QUIET, [0, 0], [0, 0], **SHORT, paths=1, rng=0),
-    ):
-        assert apart.warnings == ()
+    for scene, q0, paths in ((QUIET, [0, 0], 3), (QUIET, starts, 3), (noisy(), [0, 0], 3), (QUIET, [0, 0], 1)):
+        told = vp.simulate_ensemble(scene, q0, [0, 0], **SHORT, paths=paths, rng=0).warnings
+        same = scene is QUIET and paths > 1 and q0 is not starts
+        assert len(told) == len(about(told, "paths alike")) == same
 
 
 def problem(scene):
-    cost = vp.ControlCost(1.0) + vp.Terminal(vp.TrackingCost([0.1, 0.1]))
-    return vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], dt=0.02, steps=5)
+    return swing(scene=scene, steps=5)
 
 
 def test_a_controller_tells_of_its_plant():
@@ -89,7 +82,6 @@ def test_a_controller_tells_of_its_plant():
 
 
 def test_plans_and_their_checks_draw_nothing_and_say_nothing(caplog):
-    """Motions without noise are what plans and derivatives are about."""
     with caplog.at_level(logging.WARNING):
         plan = vp.solve(problem(noisy()), max_iterations=2)
         plan.problem.simulate(plan.policy)

@@ -1,4 +1,4 @@
-"""Policies at steps of their own and at finer ones, and what of controls goes by joint name."""
+"""Laws and policies that act once a period, in finer steps too, and controls by joint name."""
 
 from __future__ import annotations
 
@@ -29,7 +29,6 @@ def run(given, dt, steps, **options):
 
 @pytest.mark.parametrize("finer", [1, 2, 7])
 def test_a_policy_with_a_period_is_held_over_finer_steps(finer):
-    """By hand: each control from the state that its period begins with, in an open loop."""
     given, dt = policy(), PERIOD / finer
     motion = run(given, dt, INTERVALS * finer)
     np.testing.assert_array_equal(np.ptp(motion.u.reshape(INTERVALS, finer, 2), axis=1), 0.0)
@@ -120,3 +119,30 @@ def test_the_control_before_a_plan_by_name():
         assert np.abs(named.controls - mpc.plan(0.0, Q0, REST, previous).controls).max() > 1e-3
     plan = mpc.plan(0.0, Q0, REST)
     np.testing.assert_array_equal(plan.shifted(2, {"joint1": 1.0}).before, [1.0, 0.0])
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(3), vp.RungeKutta4(), vp.ExplicitEuler()], ids=str)
+def test_a_law_is_called_once_where_each_period_begins(integrator):
+    called = []
+
+    def law(t, q, v):
+        called.append((t, q, v))
+        return 3.0 * np.sin(7.0 * t) - 2.0 * v * np.abs(v) - 2.0 * q
+
+    given = {"dt": 0.01, "steps": 48, "controls": law, "period": 5, "integrator": integrator, "check": True}
+    motion = vp.simulate(SCENE, Q0, REST, **given)
+    assert len(called) == 10
+    for k, (t, q, v) in enumerate(called):
+        assert t == pytest.approx(0.05 * k, abs=1e-12)
+        np.testing.assert_array_equal(q, motion.q[5 * k])
+        np.testing.assert_array_equal(v, motion.v[5 * k])
+        np.testing.assert_array_equal(np.ptp(motion.u[5 * k : 5 * k + 5], axis=0), 0.0)
+    assert np.abs(np.diff(motion.u[::5], axis=0)).min() > 0.0
+
+
+def test_noise_that_python_evaluates_keeps_the_period():
+    motions = []
+    for noise in (vp.CustomNoise(lambda q, v, u: np.eye(2) * 0.1, 2), vp.AdditiveNoise(0.1)):
+        given = {"dt": 1e-2, "steps": 17, "controls": lambda t, q, v: -10.0 * q - v, "period": 5, "rng": 3}
+        motions.append(vp.simulate(vp.Scene(CHAIN, noise=noise), Q0, REST, **given))
+    np.testing.assert_allclose(motions[0].u, motions[1].u, atol=1e-12)

@@ -1,4 +1,4 @@
-"""The search for a plan: what changes nothing, limits, states to start from, drives at their limits, how it ends."""
+"""The search for a plan: what changes nothing, states to start from, drives at their limits, its end."""
 
 import contextlib
 import logging
@@ -7,8 +7,8 @@ import re
 import numpy as np
 import pytest
 from findings import about
-from mechanisms import slider
-from plan_problems import CAPSULES, REST, SMALL, TWO, noisy, reach
+from oracles import kkt
+from plan_problems import CAPSULES, REST, SMALL, TWO, linear, noisy, reach
 from refusals import naming, refused
 
 import varpin as vp
@@ -20,7 +20,6 @@ def constant(value):
 
 
 def numbers(reason):
-    """The expected decrease and the tolerance on it."""
     promise = re.search(r"expected decrease is (\S+?)[;, ]", reason)
     share = re.search(r"at stake is (\S+)$", reason)
     return float(promise[1]), float(share[1])
@@ -47,7 +46,6 @@ ALIKE = {
 @pytest.mark.parametrize("most", [4, 100], ids=["cut short", "converged"])
 @pytest.mark.parametrize("name", ALIKE)
 def test_what_changes_no_search(name, most):
-    """Constants are no part of what is at stake, and noise that no control steers costs the same for all motions."""
     *problems, rtol, ratio = ALIKE[name]
     one, other = (vp.solve(problem, max_iterations=most, check=False) for problem in problems)
     assert one.status is other.status is (vp.Status.CONVERGED if most > 4 else vp.Status.MAX_ITERATIONS)
@@ -62,7 +60,6 @@ def test_what_changes_no_search(name, most):
 
 
 def test_a_target_out_of_reach_does_not_loosen_the_tolerance():
-    """1000 m away: 1e6 of the cost is there to stay."""
     away = vp.Terminal(vp.FramePositionCost(TWO, "tip", [0.0, 0.0, 1000.0], 1.0))
     plan = vp.solve(reach(more=away), max_iterations=3, check=False)
     assert plan.cost > 0.9e6
@@ -86,20 +83,10 @@ def test_wrong_derivatives_stall_and_say_so():
 
 @pytest.mark.parametrize("problem", [reach(), reach(**MIDPOINT), RUNGE], ids=["Gauss", "midpoint", "RK4"])
 def test_a_search_ends_where_rounding_begins(problem):
-    """No tolerance is too small."""
     best = vp.solve(problem, tolerance=1e-18)
     assert best.status is vp.Status.CONVERGED
     assert best.gradient == pytest.approx(0.0, abs=1e-6)
     assert vp.solve(problem, best).iterations == 0
-
-
-def test_a_search_that_begins_at_the_optimum_ends_there():
-    """At rest at the goal, where gravity does nothing."""
-    at = [0.3, -1.2]
-    cost = vp.TrackingCost(at, 10.0) + vp.ControlCost(0.1) + vp.Terminal(vp.TrackingCost(at, 10.0))
-    plan = vp.solve(vp.OptimalControlProblem(vp.Scene(TWO, gravity=False), cost, at, [0, 0], dt=0.02, steps=50))
-    assert (plan.status, plan.iterations, plan.cost) == (vp.Status.CONVERGED, 0, 0.0)
-    assert plan.warnings == ()
 
 
 def test_each_line_of_the_log_names_its_search(caplog):
@@ -113,13 +100,6 @@ def test_each_line_of_the_log_names_its_search(caplog):
 # --- limits of controls ----------------------------------------------------------------------------------------------
 
 
-def test_limits_that_the_optimum_does_not_touch():
-    free, limited = SMALL["held"].plan, vp.solve(reach(control_limits=(-200.0, 200.0)), check=False)
-    assert limited.status.converged
-    assert limited.iterations <= free.iterations + 1
-    np.testing.assert_allclose(limited.controls, free.controls, rtol=0, atol=1e-3)
-
-
 def test_first_controls_are_brought_within_limits():
     problem = reach(control_limits=(-1.0, [0.5, 8.0]))
     wide = vp.LinearPolicy(np.full((12, 2), 3.0), np.zeros((12, 2, 4)), np.zeros((12, 4)))
@@ -129,54 +109,6 @@ def test_first_controls_are_brought_within_limits():
     first = vp.solve(problem, SMALL["held"].plan, max_iterations=0, check=False).controls
     assert ((first >= -1.0) & (first <= [0.5, 8.0])).all()
     np.testing.assert_array_equal(problem.holding_controls(), [-1.0, -1.0])
-
-
-@pytest.mark.parametrize(
-    "integrator", [vp.Midpoint(), vp.Gauss(2), vp.RungeKutta4(), vp.SemiImplicitEuler(), vp.Reference()], ids=str
-)
-def test_feedback_saturates(integrator):
-    """A policy's controls are clipped, whatever integrates: each as the policy by hand gives it at the node."""
-    rng = np.random.default_rng(0)
-    limits = np.array([-0.4, -0.2]), np.array([0.3, 0.1])
-    rows = rng.normal(size=(6, 2)), rng.normal(size=(6, 2, 4)), rng.normal(size=(6, 4))
-    policy = vp.LinearPolicy(*rows, hold=2, limits=limits)
-    motion = vp.simulate(vp.Scene(TWO), [0.1, 0.2], [0, 0], dt=0.05, steps=12, controls=policy, integrator=integrator)
-    x = np.hstack([motion.q, motion.p if integrator.variational else motion.v])[:-1:2]
-    wanted = policy.u + np.einsum("Rmx,Rx->Rm", policy.gains, x - policy.reference)
-    np.testing.assert_allclose(motion.u[::2], np.clip(wanted, *limits), rtol=1e-12)
-    np.testing.assert_array_equal(motion.u[1::2], motion.u[::2])
-    assert ((motion.u == limits[0]) | (motion.u == limits[1])).any()
-
-
-@pytest.mark.parametrize("noise", [vp.AdditiveNoise(0.3), vp.ControlNoise(0.05)], ids=["additive", "control"])
-def test_noise_never_drives_a_control_out_of_its_limits(noise):
-    lower, upper = np.array([-20.0, -6.0]), np.array([20.0, 6.0])
-    plan = vp.solve(reach(scene=noisy(noise), control_limits=(lower, upper)), check=False)
-    assert plan.status.converged
-    paths = vp.simulate_ensemble(
-        plan.problem.scene, REST, REST, dt=0.06, steps=12, paths=50, rng=0, controls=plan.policy
-    )
-    path = vp.simulate(plan.problem.scene, REST, REST, dt=0.06, steps=12, rng=0, controls=plan.policy)
-    assert paths.integrator == path.integrator == str(plan.problem.integrator)
-    assert ((paths.u >= lower) & (paths.u <= upper)).all()
-    saturated, planned = ((u == lower) | (u == upper) for u in (paths.u, plan.controls))
-    assert 0 < planned.sum() < planned.size
-    assert (saturated != planned).any()
-
-
-@pytest.mark.parametrize(
-    ("limits", "facts"),
-    [
-        ((1.0, -1.0), ("1", "-1", "0")),
-        ((-1.0, np.nan), ("upper[0]", "NaN")),
-        (([-1.0, -1.0, -1.0], 1.0), ("lower", "(2,)", "(3,)")),
-        (3.0, "pair"),
-        ((np.inf, np.inf), "inf"),
-    ],
-)
-def test_limits_that_are_refused(limits, facts):
-    with refused(vp.InputError, "control_limits", facts):
-        reach(control_limits=limits)
 
 
 # --- states to start from --------------------------------------------------------------------------------------------
@@ -189,14 +121,12 @@ def line(end, steps=12):
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"integrator": vp.RungeKutta4()}, {"hold": 5}, {"sampling": "midpoint"}, {"integrator": vp.Radau(2)}],
+    [{}, {"integrator": vp.RungeKutta4()}, {"hold": 4}, {"sampling": "midpoint"}, {"integrator": vp.Radau(2)}],
 )
 def test_a_linear_problem_takes_one_step(options):
-    scene = vp.Scene(slider(2.0), gravity=False, stiffness=3.0, damping=0.1)
-    cost = vp.ControlCost(0.1) + vp.VelocityCost(0.1)
-    cost += vp.Terminal(vp.TrackingCost([1.0], 100.0) + vp.VelocityCost(10.0))
-    problem = vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=0.04, steps=50, **options)
-    own, found = vp.solve(problem), vp.solve(problem, states=line([1.0], 50))
+    problem = linear(**options)
+    away = np.linspace(problem.q0, [1.0, 0.5], problem.steps + 1)
+    own, found = vp.solve(problem, check=False), vp.solve(problem, states=away, check=False)
     assert found.status.converged
     assert [row.step for row in found.history] == [1.0, 0.0]
     assert found.cost == pytest.approx(own.cost, rel=1e-12)
@@ -216,7 +146,6 @@ def test_underactuated_under_noise():
 
 
 def test_the_first_motion_follows_the_path():
-    """All joints are driven, and nothing is missing."""
     problem, path = reach(dt=0.024, steps=50), line([1.0, 0.5], 50)
     found = vp.solve(problem, states=path, max_iterations=0, check=False)
     motion = found.trajectory
@@ -228,7 +157,6 @@ def test_the_first_motion_follows_the_path():
 
 @pytest.mark.parametrize("controls", ["held", "linear"])
 def test_the_first_motion_of_servos_follows_the_path(controls):
-    """Commands are those whose springs give the torques of inverse dynamics."""
     problem, path = served(1e3, controls=controls), line(GOAL, 40)
     found = vp.solve(problem, states=path, max_iterations=0, check=False)
     np.testing.assert_allclose(found.trajectory.q, path, atol=2e-2)
@@ -277,7 +205,6 @@ def test_refused_states(states, options, facts):
 
 
 def test_a_given_first_control_stays_exactly_as_it_is():
-    """Of lines within limits of their rate, from the first iteration on, and from states, too."""
     before = np.random.default_rng(0).uniform(-5.0, 5.0, 2)
     rates = vp.WithinControlRate(400.0, before=before)
     problem = reach(rates, vp.WithinJointLimits(TWO, ([-1, -1], [1.05, 0.6])), controls="linear")
@@ -294,7 +221,6 @@ GOAL, STIFFNESS, DAMPING = np.array([1.0, -0.7]), np.array([400.0, 200.0]), np.a
 
 
 def served(effort, damping=DAMPING, begin=REST, **options):
-    """Two links on servos, in a horizontal plane."""
     servos = vp.PositionServo(STIFFNESS, damping, np.array([3.0, 1.0]) * effort)
     scene = vp.Scene(TWO, forces=[servos], gravity=False)
     cost = vp.ControlCost(1e-3, reference=GOAL) + vp.VelocityCost(1e-2)
@@ -303,17 +229,14 @@ def served(effort, damping=DAMPING, begin=REST, **options):
 
 
 def test_drives_at_their_limits_take_second_derivatives(tmp_path):
-    """By first derivatives alone it takes over 200 iterations; and a search goes on with them from a file."""
+    """By first derivatives alone it takes over 200 iterations."""
     plan = vp.solve(served(35.0), check=False)
     assert plan.status.converged
     assert plan.iterations <= 40
     problem, motion = plan.problem, plan.trajectory
     demand = (STIFFNESS * (motion.u - motion.q[:-1]) - DAMPING * motion.v[:-1]) / [105.0, 35.0]
     assert np.abs(demand).max() > 1.1
-    for seed in range(3):
-        way = np.random.default_rng(seed).normal(size=motion.u.shape)
-        ahead, behind = (problem.cost_of(problem.simulate(motion.u + step * way)) for step in (1e-5, -1e-5))
-        assert abs(ahead - behind) / 2e-5 < 1e-3 * np.linalg.norm(way)
+    assert kkt(plan) <= 1e-4
     orders = [row.second_order for row in plan.history]
     assert (orders[0], orders[-1]) == (False, True)
     assert [str(row).endswith("*") for row in plan.history] == orders

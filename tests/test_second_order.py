@@ -1,7 +1,8 @@
-"""Second derivatives of steps under constraints, against differences of the steps themselves, and what is refused."""
+"""Second derivatives of steps under constraints, against differences, and what is refused."""
 
 import numpy as np
 import pytest
+import zoo
 from refusals import refused
 
 import varpin as vp
@@ -10,25 +11,7 @@ from varpin.mechanics.assembly import along_constraints, nearest
 # Central differences of eighth order, of the first and of the second derivative.
 FIRST = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 SECOND = {0: -205 / 72, 1: 8 / 5, 2: -1 / 5, 3: 8 / 315, 4: -1 / 560}
-SIZE = 2e-3
-
-
-def five_bar(**options):
-    scene = vp.Scene(
-        vp.planar_chain(4), constraints=vp.PointOnPoint("tip", (1.6, 0.0, 0.3), axes="xz"), damping=0.3, **options
-    )
-    q = vp.assemble(scene, [-1.0, 1.0, 1.0, 1.0])
-    return scene, q, along_constraints(scene, q, np.array([1.0, 0.0, 0.0, 2.0]))
-
-
-def by_hand(interpolation):
-    hand = vp.KinematicInput("joint1", interpolation)
-    loop = vp.PointOnPoint("tip", (1.6, 0.0, 0.3), axes="xz")
-    robot = vp.planar_chain(4)
-    scene = vp.Scene(robot, constraints=[loop, hand], actuation=["joint1", "joint4"], damping=0.3)
-    free = vp.Scene(robot, constraints=loop)
-    q = vp.assemble(free, [-1.0, 1.0, 1.0, 1.0])
-    return scene, q, along_constraints(free, q, np.array([1.0, 0.0, 0.0, 2.0]))
+SIZE = 1e-3
 
 
 def first(values):
@@ -43,14 +26,19 @@ def whole(curvature):
     return np.block([[curvature.xx[0], curvature.ux[0].T], [curvature.ux[0], curvature.uu[0]]])
 
 
-SCENES = {"forces": five_bar, "linear": lambda: by_hand("linear"), "cubic": lambda: by_hand("cubic")}
+CUBIC = [zoo.CRANK[0], vp.KinematicInput("joint1", "cubic")]
+CASES = {
+    "forces": zoo.ZOO["five-bar"],
+    "linear": zoo.ZOO["cranked five-bar"],
+    "cubic": zoo.Case("", zoo.chain(4, damping=0.3, constraints=CUBIC), **zoo.FIVE, path=zoo.cranked),
+}
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(guard=None), vp.Gauss(2, guard=None)])
-@pytest.mark.parametrize("kind", SCENES)
+@pytest.mark.parametrize("kind", CASES)
 def test_against_differences_of_steps_along_the_constraints(kind, integrator):
     """Of z . x1 on curves through states that keep the constraints: f'' = x' H x' + z J x''."""
-    scene, q, v = SCENES[kind]()
+    scene, q, v = CASES[kind].scene, CASES[kind].q0, CASES[kind].v0
     rng, n = np.random.default_rng(3), 4
     u = scene.command_at(q) + 0.01 * rng.normal(size=scene.controls)
     given = {"dt": 1e-2, "steps": 1, "integrator": integrator, "check": False}

@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 from findings import about
-from naive import continuous
-from refusals import naming, refused, unnamed
+from refusals import naming, unnamed
 
 import varpin as vp
 
 
-def reach(steps: int, controls: str = "held", **options: object) -> vp.OptimalControlProblem:
+def reach(steps, controls="held", **options):
     end = vp.TrackingCost([1.5, -1.0], 1e3) + vp.VelocityCost(1e2)
     cost = vp.ControlCost(1e-3) + vp.VelocityCost(0.1) + vp.Terminal(end)
     given = {"dt": 1.0 / steps, "steps": steps, "controls": controls, "integrator": vp.Gauss(2)} | options
@@ -17,8 +16,8 @@ def reach(steps: int, controls: str = "held", **options: object) -> vp.OptimalCo
 
 
 @pytest.mark.parametrize("controls", ["held", "linear"])
-def test_the_plan_is_within_the_wish_of_the_optimum(controls: str) -> None:
-    """Coarse controls cost more, however well the robot follows: held ones 14, 3 and 1 % with 3, 6 and 12 nodes."""
+def test_the_plan_is_within_the_wish_of_the_optimum(controls):
+    """Coarse controls cost more, however well the robot follows."""
     optimum = vp.solve(reach(96, "linear"), check=False).cost
     for wish in (0.03, 3e-3):
         found = vp.solve(reach(3, controls), true_cost=wish, check=False).refinement
@@ -29,7 +28,7 @@ def test_the_plan_is_within_the_wish_of_the_optimum(controls: str) -> None:
         np.testing.assert_allclose([row.excess for row in rows], above, rtol=0.3, atol=0.1 * wish)
 
 
-def test_halvings_go_on_until_they_resolve_the_dampers() -> None:
+def test_halvings_go_on_until_they_resolve_the_dampers():
     """Losses of held controls rise at first: 10, 25, 43, 34, 6 and 0.1 %."""
     begin, rest = np.array([-1.0, 0.5]), np.zeros(2)
     inertia = vp.lagrangian_jet(vp.Scene(vp.planar_chain(2)), begin, rest).Lvv
@@ -43,38 +42,30 @@ def test_halvings_go_on_until_they_resolve_the_dampers() -> None:
     assert min(losses[1:4]) > losses[0]
 
 
-def test_held_periods_stay() -> None:
+def test_held_periods_stay():
     plan = vp.solve(reach(8, hold=2), true_cost=1e-5, check=False)
     assert plan.refinement.met
     assert plan.problem.period == pytest.approx(0.25)
     assert len(plan.controls) == 4
 
 
-def test_a_wish_out_of_reach_says_so() -> None:
+def test_a_wish_out_of_reach_says_so():
     limited = vp.solve(reach(3), true_cost=1e-12, time_limit=0.3)
     assert not limited.refinement.met
     assert not unnamed(limited.refinement.reason, "true_cost = 1e-12")
     assert naming(limited.warnings, "true_cost")
     # A reference on the problem's own grid has no values in between.
-    rows = np.zeros((7, 2))
-    fixed = vp.OptimalControlProblem(
-        vp.Scene(vp.planar_chain(2)),
-        vp.ControlCost(1.0) + vp.TrackingCost(rows, 100.0),
-        [0.0, 0.0],
-        [0.0, 0.0],
-        dt=0.2,
-        steps=6,
-        sampling="start",
-    )
+    rows = np.ones((7, 2))
+    fixed = reach(6, sampling="start").at(cost=vp.ControlCost(1.0) + vp.TrackingCost(rows, 100.0))
     stuck = vp.solve(fixed, true_cost=1e-9, check=False)
     assert not unnamed(stuck.refinement.reason, "half of dt", "reference")
 
 
 @pytest.mark.parametrize("after", [1, 12])
-def test_an_interrupt_keeps_the_best(after: int) -> None:
+def test_an_interrupt_keeps_the_best(after):
     calls = 0
 
-    def callback(_: vp.Iteration) -> None:
+    def callback(_):
         nonlocal calls
         calls += 1
         if calls == after:
@@ -93,38 +84,23 @@ def test_an_interrupt_keeps_the_best(after: int) -> None:
         assert plan.problem.dt == pytest.approx(0.25)
 
 
-def test_saved_with_the_plan(tmp_path) -> None:
+def test_saved_with_the_plan(tmp_path):
     plan = vp.solve(reach(4), true_cost=1e-4, check=False)
     again = vp.Solution.load(plan.save(tmp_path / "plan.npz"), plan.problem)
     assert again.refinement == plan.refinement
 
 
-def test_bad_wishes() -> None:
-    plan = vp.solve(reach(4), check=False)
-    with refused(vp.InputError, "true_cost"):
-        vp.solve(reach(4), true_cost=0.0)
-    with refused(vp.InputError, "resume"):
-        vp.solve(reach(4), resume=plan, true_cost=0.1)
-
-
-def within(*constraints: vp.PlanConstraint, dt: float = 0.1, steps: int = 12) -> vp.OptimalControlProblem:
-    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
-    cost += vp.Terminal(vp.TrackingCost([1.0, 0.5], 100.0) + vp.VelocityCost(10.0))
-    scene = vp.Scene(vp.planar_chain(2), damping=0.1)
-    return vp.OptimalControlProblem(scene, cost, [0, 0], [0, 0], dt=dt, steps=steps, constraints=constraints)
-
-
-def test_no_plan_within_constraints() -> None:
+def test_no_plan_within_constraints():
     """A step that has none may be too coarse, so half of it is tried, too."""
     goal = vp.ReachFrame(vp.planar_chain(2), "tip", position=[1.0, 0.5, -0.5])
-    far = vp.solve(within(goal), true_cost=0.01, check=False)
+    far = vp.solve(reach(12, constraints=goal), true_cost=0.01, check=False)
     assert far.status is vp.Status.INFEASIBLE
     assert len(far.refinement.tried) == 2
     assert not far.refinement.met
     assert about(far.refinement.reason, "no plan within constraints")
 
 
-def test_a_loss_within_the_wish_is_no_warning() -> None:
+def test_a_loss_within_the_wish_is_no_warning():
     plan = vp.solve(reach(4, "linear"), true_cost=1e-2)
     assert plan.refinement.met
     assert 2e-3 < plan.verify().closed_loop_loss < 1e-2
@@ -132,66 +108,33 @@ def test_a_loss_within_the_wish_is_no_warning() -> None:
     assert naming(vp.solve(plan.problem, plan.controls).warnings, "in quarters of dt")
 
 
-@pytest.mark.parametrize("controls", ["held", "linear"])
-def test_the_first_step_within_the_wish_is_taken(controls: str) -> None:
-    problem = reach(3, controls)
-    plan = vp.solve(problem, true_cost=1e-4)
-    found = plan.refinement
+LIMITED = {"constraints": vp.WithinVelocityLimits(vp.planar_chain(2), (-2.0, 2.0))}
+
+
+@pytest.mark.parametrize(
+    ("problem", "wish"),
+    [(reach(3), 1e-4), (reach(3, "linear"), 1e-4), (reach(12, **LIMITED), 1e-2)],
+    ids=["held", "linear", "within speeds"],
+)
+def test_the_first_step_within_the_wish_is_taken(problem, wish):
+    """Within speeds the first step costs little, but violates them."""
+    plan = vp.solve(problem, true_cost=wish)
+    found, truth = plan.refinement, plan.verify()
     assert found.met
     assert found.chosen == len(found.tried) - 1 >= 1
     assert plan.status.converged
-    assert abs(plan.verify().closed_loop_loss) <= 1e-4
-    assert all(abs(row.loss) > 1e-4 or row.excess > 1e-4 for row in found.tried[:-1])
-    assert found.tried[-1].excess <= 1e-4
-    np.testing.assert_allclose([row.dt for row in found.tried], [1 / 3 / 2**k for k in range(len(found.tried))])
+    assert abs(truth.closed_loop_loss) <= wish
+    beyond = max((told.closed_loop for told in truth.constraints), default=0.0)
+    assert found.tried[-1].violation == pytest.approx(beyond / 4.0, rel=1e-2)
+    assert beyond / 4.0 <= 1e-3
+    assert all(abs(row.loss) > wish or row.excess > wish or row.violation > 1e-3 for row in found.tried[:-1])
+    assert found.tried[-1].excess <= wish
+    np.testing.assert_allclose([row.dt for row in found.tried], problem.dt / 2.0 ** np.arange(len(found.tried)))
     assert plan.problem.steps == found.tried[-1].steps == plan.trajectory.steps
     assert str(found) in plan.table()
     # Each row is the plan of its step, from whatever controls it began.
     cold = vp.solve(problem.at(dt=found.tried[-1].dt), check=False)
     assert plan.cost == pytest.approx(cold.cost, rel=1e-5)
-
-
-def on_robot(plan: vp.Solution) -> tuple[float, np.ndarray]:
-    """The cost of a plan of ``within`` with feedback, and its velocities in eighths of steps, by DOP853."""
-    problem, policy, parts, given = plan.problem, plan.policy_on("velocity"), 8, []
-
-    def running(t: float, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> float:
-        return 1e-2 * (u @ u + v @ v)
-
-    def law(k: int, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-        if k % parts == 0:
-            decision = k // parts
-            state = np.concatenate([q, v]) - policy.reference[decision]
-            given.append(plan.controls[decision] + policy.gains[decision] @ state)
-        return given[-1]
-
-    rows = np.repeat(plan.controls, parts, axis=0)
-    q, v, integral = continuous(
-        problem.scene, problem.q0, problem.v0, rows, problem.dt / parts, running, law, rtol=1e-9
-    )
-    return integral + 100.0 * ((q[-1] - [1.0, 0.5]) ** 2).sum() + 10.0 * v[-1] @ v[-1], v
-
-
-def test_within_constraints():
-    limited = within(vp.WithinVelocityLimits(vp.planar_chain(2), (-4.8, 1.2)))
-    plan = vp.solve(limited, true_cost=0.01, check=False)
-    found = plan.refinement
-    row = found.tried[found.chosen]
-    assert found.met
-    assert plan.problem.steps == row.steps > 12
-    assert plan.status.converged
-    assert plan.violation <= 1e-6
-    # Multipliers and controls of the plan before are near those of half the step.
-    assert all(finer.iterations < found.tried[0].iterations for finer in found.tried[1:])
-    true, v = on_robot(plan)
-    assert row.true_cost == pytest.approx(true, rel=1e-4)
-    assert abs(true / plan.cost - 1.0) <= 0.01
-    # Held controls exceed the limit between nodes: at 0.1 s by a thirtieth of what is allowed to rest.
-    beyond = (v - 1.2).max() / 6.0
-    assert row.violation == pytest.approx(beyond, rel=1e-2)
-    assert 1e-4 < beyond < 1e-3 < found.tried[0].violation
-    fine = vp.solve(limited.at(dt=plan.problem.dt / 2), check=False)
-    assert fine.violation <= 1e-6
-    assert true <= 1.01 * fine.cost
-    with refused(vp.InputError, "resume", "true_cost"):
-        vp.solve(limited, resume=plan, true_cost=0.1)
+    # Its controls cost no more than the wish above those of a far finer step.
+    best = vp.solve(problem.at(dt=plan.problem.dt / 4), check=False).cost
+    assert truth.closed_loop_cost <= (1.0 + 2.0 * wish) * best

@@ -1,4 +1,4 @@
-"""Convex hulls as obstacles of a plan, against boxes, least squares and differences; SRDF files of other robots."""
+"""Obstacles of plans: distances by least squares, slopes by differences, drawings, SRDF files."""
 
 import pickle
 from itertools import product
@@ -6,16 +6,16 @@ from itertools import product
 import numpy as np
 import pytest
 from chromium import animation, commands
+from plan_problems import CAPSULES, TWO, reach
 from refusals import refused
 from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
 import varpin as vp
 from varpin import replay
-from varpin.model.clearance import clearance
+from varpin.model.clearance import capsule_around, clearance
 from varpin.model.kinematics import frame_kinematics
 
-ARM = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05), "joint2": ([0, 0, 0], [1, 0, 0], 0.05)}
 CUBE = np.array(list(product([-0.5, 0.5], repeat=3)))
 TURN = Rotation.from_euler("xyz", [0.3, -0.5, 0.8]).as_matrix()
 # The base of a wedge, whose edge lies above one of its sides.
@@ -32,7 +32,7 @@ def drum(corners=64):
 
 
 def apart(points, segment):
-    """Distance of a hull to a segment: least squares with non-negative shares that sum to 1 on each side."""
+    """By least squares with non-negative shares that sum to 1 on each side."""
     heavy = 1e5
     ones, none = np.ones(len(points)), np.zeros(len(points))
     rows = np.vstack(
@@ -48,7 +48,6 @@ def apart(points, segment):
 
 
 def test_eight_points_are_a_box():
-    """Clear of it and inside; placed by its points, or by position and rotation; with slopes and on the move."""
     robot = vp.load_robot("ur5")
     center, sides = np.array([0.4, 0.2, 0.4]), np.array([0.3, 0.2, 0.5])
 
@@ -76,21 +75,23 @@ def test_eight_points_are_a_box():
         np.testing.assert_allclose(measure.slopes(q), expected.slopes(q), atol=1e-8)
 
 
-@pytest.mark.parametrize("points", [WEDGE, drum()], ids=["wedge", "drum"])
-def test_distances_are_those_of_least_squares(points):
+@pytest.mark.parametrize(
+    ("points", "radius"), [(WEDGE, 0.0), (drum(), 0.0), (WEDGE[[1, 4]], 0.1)], ids=["wedge", "drum", "capsule"]
+)
+def test_distances_are_those_of_least_squares(points, radius):
     rng = np.random.default_rng(1)
     robot = vp.planar_chain(1)
     (R,), (p,) = frame_kinematics(robot, "joint1").placements(np.zeros((1, 1)))
-    hull = vp.Obstacle.convex(points)
+    made = vp.Obstacle.capsule(*points, radius) if radius else vp.Obstacle.convex(points)
     clear = 0
     for _ in range(40):
         segment = 0.7 * rng.normal(size=(2, 3))
         here = (segment - p) @ R
-        found = clearance(robot, [hull], capsules={"joint1": (*here, 0.05)}).distances(np.zeros((1, 1)))[0, 0]
+        found = clearance(robot, [made], capsules={"joint1": (*here, 0.05)}).distances(np.zeros((1, 1)))[0, 0]
         known = apart(points, segment)
         if known > 1e-6:
             clear += 1
-            assert found == pytest.approx(known - 0.05, abs=1e-9)
+            assert found == pytest.approx(known - 0.05 - radius, abs=1e-9)
         else:
             assert found < -0.05 + 1e-6
     assert clear > 15
@@ -98,25 +99,24 @@ def test_distances_are_those_of_least_squares(points):
 
 def test_slopes_are_differences():
     robot = vp.load_robot("ur5")
-    hulls = [
+    made = [
+        vp.Obstacle.sphere([0.4, 0.2, 0.5], 0.15),
+        vp.Obstacle.box([-0.3, 0.2, 0.3], [0.2, 0.3, 0.2]),
+        vp.Obstacle.capsule([0.5, -0.5, 0.0], [0.5, -0.5, 1.0], 0.05),
         vp.Obstacle.convex(WEDGE, [-0.5, 0.2, 0.3], TURN),
         vp.Obstacle.convex(drum(), [0.6, -0.4, 0.4], TURN.T),
     ]
-    measure = clearance(robot, hulls, links=list(UR5), capsules=UR5)
-    q = np.random.default_rng(2).normal(size=(12, 6))
+    measure = clearance(robot, made, itself=True)
+    q = np.random.default_rng(0).normal(size=(20, 6))
     slopes = measure.slopes(q)
-    for c in range(6):
-        e = 1e-6 * np.eye(6)[c]
+    for c, e in enumerate(1e-6 * np.eye(6)):
         found = (measure.distances(q + e) - measure.distances(q - e)) / 2e-6
         np.testing.assert_allclose(slopes[:, :, c], found, atol=1e-7)
-
-
-def around(obstacle, steps=30):
-    robot = vp.planar_chain(2)
-    cost = vp.ControlCost(1e-3) + vp.VelocityCost(1e-2) + vp.Terminal(vp.TrackingCost([1.5, 0.3], 10.0))
-    clear = vp.KeepClear(robot, [obstacle], 0.02, links=["joint2"], capsules=ARM)
-    options = {"dt": 0.05, "steps": steps, "constraints": [clear]}
-    return vp.OptimalControlProblem(vp.Scene(robot, damping=0.1), cost, [0.0, 0.0], np.zeros(2), **options)
+    points = np.random.default_rng(1).normal(size=(500, 3)) * [1.0, 0.2, 0.1]
+    begin, end, radius = capsule_around(points)
+    along = np.clip((points - begin) @ (end - begin) / ((end - begin) @ (end - begin)), 0.0, 1.0)
+    away = np.linalg.norm(points - begin - along[:, None] * (end - begin), axis=1)
+    assert away.max() == pytest.approx(radius, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -137,9 +137,8 @@ def test_what_is_no_hull_is_refused(given, facts):
 
 
 def test_drawn_where_it_is(tmp_path):
-    """Its corners in the world, over its way, in the page, and its triangles closed and facing outwards."""
     hull = vp.Obstacle.convex(WEDGE, [0.5, 0.1, 0.2], TURN).moving(lambda t: [t, 0.0, 0.0])
-    problem = around(hull)
+    problem = reach(vp.KeepClear(TWO, [hull], capsules=CAPSULES))
     known = WEDGE @ TURN.T + [0.5, 0.1, 0.2]
     page = replay(
         problem.scene.robot, np.zeros((2, 2)), dt=1.0, marks=vp.Marks(constraints=problem), html=tmp_path / "wedge.html"
@@ -157,52 +156,6 @@ def test_drawn_where_it_is(tmp_path):
     assert (a * np.cross(b, c)).sum() / 6.0 == pytest.approx(0.5 * 0.4 * 0.25 * 0.3, rel=1e-5)
     (track,) = [values for (path, _), (_, values) in animation(page)[0].items() if "notes" in path]
     np.testing.assert_allclose(np.diff(track, axis=0), [[1.0, 0.0, 0.0]], atol=1e-6)
-
-
-SCENE = """
-[robot]
-source = "ur5"
-[initial]
-q = [0.0, -1.2, 1.4, -1.8, -1.57, 0.0]
-[horizon]
-dt = 0.05
-steps = 2
-[[cost]]
-type = "control"
-[[plan_constraint]]
-type = "clearance"
-links = ["wrist_3_link"]
-[[plan_constraint.obstacles]]
-type = "convex"
-points = [[1, 0, 0], [1.4, 0, 0], [1, 0.3, 0], [1, 0, 0.25]]
-[[plan_constraint.obstacles]]
-type = "convex"
-name = "other"
-points = [[1, 0, 1], [1.4, 0, 1], [1, 0.3, 1], [1, 0, 1.25], [1.1, 0.1, 1.1]]
-"""
-
-
-def test_scene_files_take_meshes_and_srdf_files(tmp_path):
-    """A mesh's file gives the hull of its vertices, a missing one an error at its key."""
-    (tmp_path / "tetra.obj").write_text("v 1 0 0\nv 1.4 0 0\nv 1 0.3 0\nv 1 0 0.25\nf 1 2 3\nf 1 2 4\n")
-    path = tmp_path / "arm.toml"
-    text = SCENE.replace(
-        '"convex"\npoints = [[1, 0, 0], [1.4, 0, 0], [1, 0.3, 0], [1, 0, 0.25]]', '"mesh"\npath = "tetra.obj"'
-    )
-    path.write_text(text, encoding="utf-8")
-    one, other = vp.load_scene(path).problem.constraints[0].obstacles
-    np.testing.assert_allclose(one.begin + one.hull.points.max(axis=0), [1.4, 0.3, 0.25])
-    assert (one.name, other.name) == ("tetra", "other")
-    for old, new, facts in [
-        ("tetra.obj", "lost.obj", ("plan_constraint[0].obstacles[0].path", "there is no file", "lost.obj")),
-        ('"tetra.obj"', "7", ("plan_constraint[0].obstacles[0].path", "7")),
-        ("links =", 'srdf = "lost.srdf"\nlinks =', ("plan_constraint[0].srdf", "lost.srdf")),
-        ("links =", 'srdf = "tetra.obj"\nlinks =', ("plan_constraint[0]", "srdf", "itself")),
-    ]:
-        assert old in text
-        path.write_text(text.replace(old, new), encoding="utf-8")
-        with refused(vp.SceneFileError, *facts):
-            vp.load_scene(path)
 
 
 def srdf_of(path, *pairs):
