@@ -24,6 +24,9 @@ from varpin.mechanics.noise import BoundNoise, Noise
 ROBOT = vp.planar_chain(2)
 SCENE, NOISY = vp.Scene(ROBOT), vp.Scene(ROBOT, noise=vp.AdditiveNoise(1e-3))
 CLEAR = {"obstacles": [vp.Obstacle.sphere([2, 0, 0], 0.1)], "capsules": {"tip": ([0, 0, 0], [0, 0, -1.0], 0.05)}}
+TIED, CALLED = {"a": "tip", "b": "universe"}, {"f": lambda q, v: np.zeros(2)}
+DRAWN = {"field": lambda q, v, u: np.zeros((2, 1)), "processes": 1}
+ABLE = {"robot": ROBOT, "frame": "tip", "least": 0.1, "directions": ["x", "z"]}
 FINER = {"increments": [[0.1], [0.2]], "dt": 0.1, "rng": 0}
 
 extremes = [0.0, -0.0, 1.0, -1.0, 1e-320, 1e-160, 1e160, -1e160, 1e308, np.inf, np.nan]
@@ -97,11 +100,29 @@ def noise_of(kind):
 # Each argument of a function is given anything; the others keep their defaults.
 FUNCTIONS = {
     "robot": (lambda links=2, **given: vp.planar_chain(links, **given), ("links", "length", "mass")),
-    "load_robot": (lambda **given: vp.load_robot("ur5", **given), ("package_dirs", "mimic", "lock")),
+    "load_robot": (
+        lambda **given: vp.load_robot("ur5", **given),
+        ("package_dirs", "mimic", "lock", "payload"),
+    ),
+    "joint": (lambda keep: vp.load_robot("ur5", keep=keep), ("keep",)),
+    "combine": (lambda **given: vp.combine(ROBOT, ROBOT, **given), ("prefixes", "placements")),
+    "posture": (ROBOT.posture, ("name",)),
+    "velocity": (ROBOT.velocity, ("v",)),
+    "inspect_robot": (lambda **given: vp.inspect_robot(ROBOT, **given), ("meshes",)),
     "Scene": (
         of_scene,
         ("robot", "gravity", "damping", "stiffness", "rest", "friction", "actuation", "noise", "forces"),
     ),
+    "without": (SCENE.without, ("joints",)),
+    "required": (lambda **given: SCENE.required([0.0, 0.0], **given), ("task", "controls")),
+    "frame": (lambda frame: of_scene(forces=vp.FrameWrench(frame, np.ones(6))), ("frame",)),
+    "FrameOnFrame": (lambda **given: of_scene(constraints=vp.FrameOnFrame(**(TIED | given))), ("a", "b")),
+    "CustomForce": (lambda **given: of_scene(forces=vp.CustomForce(**(CALLED | given))), ("f", "derivatives")),
+    "CustomNoise": (lambda **given: of_scene(noise=vp.CustomNoise(**(DRAWN | given))), ("processes", "check")),
+    "cost": (lambda frame: vp.FrameVelocityCost(ROBOT, frame), ("frame",)),
+    "ManipulabilityCost": (lambda **given: vp.ManipulabilityCost(**(ABLE | given)), ("frame", "directions")),
+    "limits": (lambda limits: vp.WithinJointLimits(ROBOT, limits), ("limits",)),
+    "part": (lambda **given: motion().part(**({"begin": 1, "end": 2} | given)), ("begin", "end")),
     "simulate": (
         motion,
         ("scene", "q0", "v0", "dt", "steps", "controls", "increments", "rng", "integrator", "period", "check"),

@@ -84,7 +84,7 @@ WRONG = {
     "no robot": (lambda arm: vp.combine(arm, "ur5"), "robots"),
     "placements": (lambda arm: vp.combine(arm, arm, placements=[None]), ("placements", "2")),
     "planar": (lambda arm: vp.combine(arm, arm, placements=[None, "planar"]), "base="),
-    "a place": (lambda arm: vp.combine(arm, arm, placements=[None, [2.0, 0.0, 0.0]]), ("placement", "'chain2'")),
+    "a place": (lambda arm: vp.combine(arm, arm, placements=[None, [2.0, 0.0, 0.0]]), ("placements", "'chain2'")),
     "no rotation": (lambda arm: vp.combine(arm, arm, placements=[None, 2.0 * np.eye(4)]), "rotation"),
     "prefixes": (lambda arm: vp.combine(arm, arm, prefixes="ab"), "prefixes"),
     "alike": (lambda arm: vp.combine(arm, arm, prefixes=["", ""]), "'joint1'"),

@@ -498,5 +498,6 @@ def test_end_effector_is_where_pinocchio_says(load):
     with refused(vp.UnknownFrame, "'panda'", "'hand'", "'panda_hand'"):
         panda.frame_positions(q, "hand")
     np.testing.assert_array_equal(panda.frame_positions(q[0], "panda_hand"), panda.frame_positions(q, "panda_hand")[0])
-    with refused(vp.InputError, "q", "(N, 3)", "(3,)", "(2,)"):
+    np.testing.assert_array_equal(chain.frame_positions(rng.normal(size=(2, 0, 3))), np.zeros((2, 0, 3)))
+    with refused(vp.InputError, "q", "(..., 3)", "(2,)"):
         chain.frame_positions(np.zeros(2))

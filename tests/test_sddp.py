@@ -11,6 +11,7 @@ from mechanisms import random_inertia
 from refusals import refused
 
 import varpin as vp
+from varpin.errors import UnknownName
 
 WEIGHTS = {1: 2 / 3, 2: -1 / 12}
 SAMPLINGS = ["midpoint", "gauss", "start"]
@@ -513,6 +514,9 @@ def test_the_same_problem_otherwise():
     for dt in (-0.1, "fast"):
         with refused(vp.InputError, "dt"):
             problem.at(dt=dt)
+    for value in (None, 30):
+        with refused(UnknownName, "'stpes'", "'steps'"):
+            problem.at(stpes=value)
     rows = vp.TrackingCost(np.zeros((21, 2)))
     with refused(vp.InputError, "(41, 2)"):
         small(rows).at(dt=0.025)
