@@ -28,6 +28,9 @@ CLEAR = {
     "obstacles": [vp.Obstacle.sphere([2, 0, 0], 0.1)],
     "capsules": {"tip": ([0, 0, 0], [0, 0, -1.0], 0.05)},
 }
+TIED, CALLED = {"a": "tip", "b": "universe"}, {"f": lambda q, v: np.zeros(2)}
+DRAWN = {"field": lambda q, v, u: np.zeros((2, 1)), "processes": 1}
+ABLE = {"robot": ROBOT, "frame": "tip", "least": 0.1, "directions": ["x", "z"]}
 FINER = {"increments": [[0.1], [0.2]], "dt": 0.1, "rng": 0}
 
 extremes = [0.0, -0.0, 1.0, -1.0, 1e-320, 1e-160, 1e160, -1e160, 1e308, np.inf, np.nan]
@@ -101,8 +104,23 @@ DISCRETE = {"scene": SCENE, "q0": [0.0, 0.0], "q1": [0.0, 0.0], "dt": 0.1}
 # Each argument of a function is given anything; the others keep their defaults.
 FUNCTIONS = {
     "robot": (within(vp.planar_chain, links=2), "links length mass"),
-    "load_robot": (within(vp.load_robot, source="ur5"), "package_dirs mimic lock"),
+    "load_robot": (within(vp.load_robot, source="ur5"), "package_dirs mimic lock payload"),
+    "joint": (within(vp.load_robot, source="ur5"), "keep"),
+    "combine": (lambda **given: vp.combine(ROBOT, ROBOT, **given), "prefixes placements"),
+    "posture": (ROBOT.posture, "name"),
+    "velocity": (ROBOT.velocity, "v"),
+    "inspect_robot": (lambda **given: vp.inspect_robot(ROBOT, **given), "meshes"),
     "Scene": (of_scene, "robot gravity damping stiffness rest friction actuation noise forces"),
+    "without": (SCENE.without, "joints"),
+    "required": (within(SCENE.required, q0=[0.0, 0.0]), "task controls"),
+    "frame": (lambda frame: of_scene(forces=vp.FrameWrench(frame, np.ones(6))), "frame"),
+    "FrameOnFrame": (lambda **given: of_scene(constraints=vp.FrameOnFrame(**(TIED | given))), "a b"),
+    "CustomForce": (lambda **given: of_scene(forces=vp.CustomForce(**(CALLED | given))), "f derivatives"),
+    "CustomNoise": (lambda **given: of_scene(noise=vp.CustomNoise(**(DRAWN | given))), "processes check"),
+    "cost": (lambda frame: vp.FrameVelocityCost(ROBOT, frame), "frame"),
+    "ManipulabilityCost": (within(vp.ManipulabilityCost, **ABLE), "frame directions"),
+    "limits": (within(vp.WithinJointLimits, robot=ROBOT), "limits"),
+    "part": (lambda **given: motion().part(**({"begin": 1, "end": 2} | given)), "begin end"),
     "simulate": (motion, "scene q0 v0 dt steps controls increments rng integrator period check"),
     "simulate_ensemble": (ensemble, "q0 v0 dt steps paths rng controls quantiles store progress integrator"),
     "policy": (fed, "u gains reference hold on limits before period previous_gains integrator"),

@@ -395,7 +395,6 @@ def test_derivatives_that_cannot_be():
 @pytest.mark.parametrize(
     ("make", "facts"),
     [
-        (lambda r: vp.FramePositionCost(r, [0, 0, 0], "tip"), ("FramePositionCost", "[0, 0, 0]")),
         (lambda r: vp.FrameVelocityCost(r, "base_link"), ("'base_link'", "'ur5'")),
         (lambda r: vp.JointLimitBarrier("ur5"), "str"),
         (lambda r: vp.FramePositionCost(r, "tool0", [0, 0, 0], [1, 2]), ("FramePositionCost weight", "3")),
@@ -427,6 +426,8 @@ def test_frames_and_robots_that_are_others(load, tmp_path):
     with refused(vp.UnknownFrame, "'ur5'", "'tool'", "'tool0'") as e:
         vp.FramePositionCost(robot, "tool", [0, 0, 0])
     assert "tool0" in e.value.matches
+    with refused(vp.UnknownFrame, "'ur5'", "'[0, 0, 0]'"):
+        vp.FramePositionCost(robot, [0, 0, 0], "tip")
     inertia = '<inertial><mass value="0"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
     light = vp.load_robot(str(mechanisms.arm(tmp_path, inertia)))
     with refused(vp.InputError, "mass"):

@@ -10,6 +10,7 @@ from plan_problems import linear, reach, small, wave
 from refusals import refused
 
 import varpin as vp
+from varpin.errors import UnknownName
 
 
 def test_line_search_is_on_the_expected_cost():
@@ -168,6 +169,9 @@ def test_the_same_problem_otherwise():
     for dt in (-0.1, "fast"):
         with refused(vp.InputError, "dt"):
             problem.at(dt=dt)
+    for value in (None, 30):
+        with refused(UnknownName, "'stpes'", "'steps'"):
+            problem.at(stpes=value)
     rows = vp.TrackingCost(np.zeros((21, 2)))
     with refused(vp.InputError, "(41, 2)"):
         small(rows).at(dt=0.025)

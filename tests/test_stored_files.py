@@ -132,6 +132,20 @@ def test_every_entry_is_checked(name, tmp_path):
         assert entry.split(".")[-1] in str(caught.value), entry
 
 
+@pytest.mark.parametrize(
+    ("entry", "other"),
+    [
+        ("statistics.substeps", lambda kept: np.append(0, kept[1:])),
+        ("statistics.substeps", lambda kept: kept * 2**62),
+        ("statistics.substeps", lambda kept: kept * 3),
+        ("statistics.halvings", lambda kept: np.append(kept, np.uint8(1))),
+    ],
+)
+def test_parts_that_do_not_fill_the_steps(entry, other, tmp_path):
+    kept = members_of("trajectory.npz")[entry]
+    unread("trajectory.npz", changed(tmp_path, "trajectory.npz", **{entry: other(kept)}), entry)
+
+
 def last(value: float) -> Callable[[np.ndarray], np.ndarray]:
     return lambda array: np.where(np.arange(array.size).reshape(array.shape) == array.size - 1, value, array)
 

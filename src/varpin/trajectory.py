@@ -19,7 +19,7 @@ from varpin.errors import FileError, InputError
 from varpin.finding import Finding
 from varpin.io.archive import Axes, read_npz, record_of, save_npz
 from varpin.model import Robot, require_robot
-from varpin.support.checks import path_like
+from varpin.support.checks import count, path_like
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, table, warning_count
 
@@ -70,6 +70,15 @@ class StepStatistics(Frozen):
     def split_steps(self) -> int:
         """Number of steps that were split into parts."""
         return int(np.count_nonzero(self.substeps > 1))
+
+    @property
+    def whole(self) -> bool:
+        """Whether the parts of each split step fill it; explicit integrators count no parts."""
+        parts = self.substeps[self.substeps > 1]
+        if (self.substeps < self.substeps.any()).any() or parts.sum() != len(self.halvings):
+            return False
+        lengths = np.bincount(np.repeat(np.arange(len(parts)), parts), 0.5**self.halvings)
+        return bool((lengths == 1.0).all())
 
     def part(self, begin: int, end: int) -> StepStatistics:
         """Statistics of the steps begin .. end, as views."""
@@ -286,6 +295,8 @@ class Trajectory(Frozen):
 
     def part(self, begin: int, end: int) -> Trajectory:
         """Steps begin .. end with the nodes around them, as views."""
+        if not 0 <= count("begin", begin) <= count("end", end) <= self.steps:
+            raise InputError(f"a part is from begin to end within {self.steps} steps, got {begin} and {end}")
         if begin == 0 and end == self.steps:
             return self
         nodes, steps = slice(begin, end + 1), slice(begin, end)
@@ -373,6 +384,8 @@ class Trajectory(Frozen):
         expected = found.t[0] + np.arange(found.steps + 1) * found.dt
         if not found.dt > 0.0 or not np.allclose(found.t, expected, rtol=1e-9, atol=1e-9 * found.dt):
             raise FileError(f"{source}: its times t are not dt = {found.dt} s apart")
+        if not found.statistics.whole:
+            raise FileError(f"{source}: statistics.substeps and statistics.halvings are not those of whole steps")
         if robot is not None:
             found._require_robot(source, robot)
         return found

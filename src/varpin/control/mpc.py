@@ -193,7 +193,7 @@ class Mpc:
         require_problem(self.problem)
         count("iterations", self.iterations, least=1)
         positive("tolerance", self.tolerance, "1")
-        if self.budget != np.inf:
+        if real("budget", self.budget) != np.inf:
             positive("budget", self.budget, "s")
 
     def _repr_html_(self) -> str:

@@ -27,7 +27,7 @@ from varpin.control.costs import (
     control_rate,
     with_control_before,
 )
-from varpin.errors import InputError
+from varpin.errors import InputError, UnknownName
 from varpin.finding import announce
 from varpin.integrators import Gauss, Integrator, Radau
 from varpin.integrators.registry import require_motion
@@ -69,7 +69,9 @@ STAGES = 4
 FASTEST, _SINGULAR = 0.25, 1e-9
 # Arguments of a problem that another state, time or control before the horizon may change.
 _MOVED = {"q0", "v0", "t0"}
-_GRID = ("dt", "steps", "integrator", "sampling", "hold", "controls", "between_nodes")
+# All that another problem may have in place of its own.
+_KEPT = ("cost", "q0", "v0", "t0", "dt", "steps", "integrator", "sampling", "hold", "controls", "control_limits",
+         "constraints", "between_nodes")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -310,9 +312,11 @@ class OptimalControlProblem(Frozen):
             changes: Any arguments of the problem but the scene; None leaves one as it is.
 
         Raises:
-            InputError: The horizon is no multiple of ``dt``; ``before`` is given where changes of controls have
-                neither cost nor limit; or as for the problem itself.
+            InputError: There is no such argument; the horizon is no multiple of ``dt``; ``before`` is given where
+                changes of controls have neither cost nor limit; or as for the problem itself.
         """
+        for name in changes.keys() - {*_KEPT, "duration"}:
+            raise UnknownName(name, (*_KEPT, "duration"), "at has no argument")
         if before is not None and not self.remembers:
             raise InputError("before is what a ControlRateCost or a WithinControlRate begins with: give one")
         given = {name: value for name, value in changes.items() if value is not None}
@@ -329,7 +333,7 @@ class OptimalControlProblem(Frozen):
             given["constraints"] = tuple(item.after(control) for item in kept)
         if moves:
             return self._moved(given)
-        same = {name: getattr(self, name) for name in (*_MOVED, *_GRID, "cost", "constraints", "control_limits")}
+        same = {name: getattr(self, name) for name in _KEPT}
         if self.integrator_by_default:
             same["integrator"] = None
         return OptimalControlProblem(self.scene, **same | given)

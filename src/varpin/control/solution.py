@@ -26,7 +26,7 @@ from varpin.finding import Finding
 from varpin.io.archive import Axes
 from varpin.linearization import velocity_at_nodes
 from varpin.signals.policy import LinearPolicy
-from varpin.support.checks import JointValues, count, positive, word
+from varpin.support.checks import JointValues, count, flag, positive, word
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, folded, listed, table, warning_count
 from varpin.trajectory import Trajectory
@@ -221,6 +221,7 @@ class Solution(Frozen):
         own: Literal["momentum", "velocity"] = "momentum" if self.problem.integrator.variational else "velocity"
         x = own if x is None else x
         word("x", x, ("momentum", "velocity"))
+        parts = count("substeps", substeps, least=1)
         gains, trajectory, hold = self.gains, self.trajectory, self.problem.hold
         rows, n = slice(0, -1, hold), self.problem.scene.robot.dof
         linear, previous_gains = self.problem.linear, self.previous_gains
@@ -240,7 +241,7 @@ class Solution(Frozen):
         reference = np.hstack([trajectory.q[rows], (trajectory.p if x == "momentum" else trajectory.v)[rows]])
         u, before = (self.controls[1:], self.controls[0]) if linear else (self.controls, self.problem.before)
         given = u, gains, reference, x
-        return self.problem.policy_of(*given, before=before, previous_gains=previous_gains, substeps=substeps)
+        return self.problem.policy_of(*given, before=before, previous_gains=previous_gains, substeps=parts)
 
     def verify(
         self, *, tolerance: float = 1e-10, max_substeps: int = 1024, progress: Callable[[int, int], None] | None = None
@@ -303,7 +304,7 @@ class Solution(Frozen):
             MonteCarloInterrupted: Ctrl-C; holds the result of the paths done. It is a KeyboardInterrupt.
         """
         policy, gains = self.policy, Feedback(self.gains, self.previous_gains)
-        if not feedback:
+        if not flag("feedback", feedback):
             policy, gains = policy.without_feedback(), Feedback(np.zeros(self.gains.shape), None)
         steps, known = Steps(self.problem, self.trajectory), np.isfinite(self.noise_cost)
         return monte_carlo(

@@ -322,7 +322,7 @@ class Variational(Compiled):
             "q": trajectory.q[:-1],
             "p": trajectory.p[:-1],
             "force": force,
-            "substeps": statistics.substeps,
+            "substeps": np.maximum(statistics.substeps, 1),
             "halvings": statistics.halvings,
             "guess": self._guess(trajectory),
         }

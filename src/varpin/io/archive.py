@@ -210,8 +210,8 @@ class _Reader:
         columns = []
         for _, own, hint in _entries(kind, f"{name}."):
             columns.append([self.scalar(hint, each, own) for each in self.listed(own, 1)])
-        if len(set(map(len, columns))) > 1:
-            raise self.error(name, "columns of different lengths", "a table")
+            if len(columns[-1]) != len(columns[0]):
+                raise self.error(own, f"a column of {len(columns[-1])} rows", f"{len(columns[0])} as the first one")
         return tuple(kind(*row) for row in zip(*columns, strict=True))
 
     def entry(self, name: str) -> Entry:

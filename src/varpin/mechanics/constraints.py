@@ -23,7 +23,16 @@ from varpin.core.arrays import Carried, ConstraintRows, CustomRows, Product, Tie
 from varpin.errors import InputError
 from varpin.mechanics.forces import Described, End, Point, ends_of, shown
 from varpin.model import Robot
-from varpin.support.checks import as_floats, count, finite_array, positive, returned, rotation_matrix, word
+from varpin.support.checks import (
+    as_floats,
+    count,
+    finite_array,
+    positive,
+    require_function,
+    returned,
+    rotation_matrix,
+    word,
+)
 from varpin.support.differences import slopes
 
 _AXES = "xyz"
@@ -259,9 +268,7 @@ class CustomConstraint(Constraint):
     def __post_init__(self) -> None:
         count("rows", self.rows, least=1)
         for name in ("value", "jacobian", "curvature"):
-            function = getattr(self, name)
-            if not callable(function) and (function is not None or name != "curvature"):
-                raise InputError(f"CustomConstraint: {name} must be a function of q, got {function!r}")
+            require_function(f"CustomConstraint {name}", getattr(self, name), "q", optional=name == "curvature")
 
     def bind(self, robot: Robot) -> Bound:  # noqa: ARG002
         r = int(self.rows)

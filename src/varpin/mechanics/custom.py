@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import reprlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
@@ -15,7 +14,7 @@ from varpin.core.arrays import Coupling, Element
 from varpin.errors import InputError
 from varpin.mechanics.forces import Force
 from varpin.model import Robot
-from varpin.support.checks import returned
+from varpin.support.checks import is_one_of, require_function, returned
 from varpin.support.differences import EIGHTH
 from varpin.support.frozen import Frozen
 
@@ -60,12 +59,9 @@ class CustomForce(Force):
     derivatives: Slopes | Literal["complex"] | None = None
 
     def __post_init__(self) -> None:
-        if not callable(self.f):
-            raise InputError(f"CustomForce takes a function of (q, v), got {reprlib.repr(self.f)}")
-        if not (self.derivatives is None or self.derivatives == "complex" or callable(self.derivatives)):
-            raise InputError(
-                f"CustomForce derivatives must be a function of (q, v), 'complex' or None, got {self.derivatives!r}"
-            )
+        require_function("CustomForce f", self.f, "(q, v)")
+        if not is_one_of(self.derivatives, ("complex",)):
+            require_function("CustomForce derivatives", self.derivatives, "(q, v), or 'complex'", optional=True)
 
     def __repr__(self) -> str:
         how = "given" if callable(self.derivatives) else f"by {'complex steps' if self.derivatives else 'differences'}"

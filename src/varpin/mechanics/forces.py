@@ -104,13 +104,13 @@ def kept(name: str, value: Any) -> Any:
 
 def shown(value: Any) -> str:
     """A parameter as text."""
-    if isinstance(value, str | int):
-        return repr(value)
     if callable(value):
         return str(getattr(value, "__name__", repr(value)))
     if isinstance(value, tuple):
         return f"({', '.join(map(shown, value))})"
-    return str(dict(value) if isinstance(value, Mapping) else value.tolist())
+    if isinstance(value, np.ndarray):
+        return str(value.tolist())
+    return repr(dict(value) if isinstance(value, Mapping) else value)
 
 
 # Parameters of forces on joints, other than those >= 0: of any sign, > 0 where the force acts, and limits, with the

@@ -27,7 +27,9 @@ from varpin.support.checks import (
     broadcast_array,
     count,
     finite_array,
+    flag,
     joint_array,
+    require_function,
     returned,
     tuple_of,
 )
@@ -270,11 +272,9 @@ class CustomNoise(Noise):
     def bind(self, actuation: Floats, joints: Sequence[str]) -> BoundNoise:  # noqa: ARG002
         count("CustomNoise processes", self.processes)
         for name in ("field", "dq", "dv", "du"):
-            value = getattr(self, name)
-            if not callable(value) and (value is not None or name == "field"):
-                raise InputError(f"CustomNoise {name} must be a function of (q, v, u), got {value!r}")
+            require_function(f"CustomNoise {name}", getattr(self, name), "(q, v, u)", optional=name != "field")
         n, m = actuation.shape
-        if self.check:
+        if flag("CustomNoise check", self.check):
             self._compare(n, m)
         return BoundNoise(_noise(n, m, self.processes).arrays, ((0, self),))
 

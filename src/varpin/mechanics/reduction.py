@@ -17,7 +17,7 @@ from varpin.mechanics.noise import BoundNoise
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot, combine
 from varpin.model.loading import hold_joints
-from varpin.support.checks import JointValues, as_floats, joint_array
+from varpin.support.checks import JointValues, as_floats, joint_array, tuple_of
 from varpin.support.markup import facts, listed
 
 # Share of the largest torque of gravity that is rounding.
@@ -102,7 +102,7 @@ def idle_joints(
     if given.shape[1] != scene.controls:
         raise InputError(f"controls must have shape ({scene.controls},) or (N, {scene.controls}), got {given.shape}")
     touched |= (scene.actuation != 0.0)[:, (given != rest).any(axis=0)].any(axis=1)
-    for name in task:
+    for name in tuple_of("task", task, str):
         touched[robot.coordinate(name)] = True
     busy = np.isin(scene.group, scene.group[touched])
     for part in robot.parts:
@@ -128,9 +128,7 @@ def _weighed(scene: Scene, q: Floats) -> Mask:
 def without(scene: Scene, joints: Mapping[str, float] | Collection[str]) -> Scene:
     """See :meth:`Scene.without`."""
     names = scene.robot.joint_names
-    if isinstance(joints, str):
-        raise InputError(f"without takes several names, or positions by name, as in {{{joints!r}: 0.0}}")
-    held = dict(joints) if isinstance(joints, Mapping) else dict.fromkeys(joints, 0.0)
+    held = dict(joints if isinstance(joints, Mapping) else dict.fromkeys(tuple_of("joints", joints, str), 0.0))
     for name in held:
         if name not in names:
             raise UnknownJoint(str(name), names, "without: the robot has no joint")

@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import chain
 from types import MappingProxyType
 
+import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
@@ -16,6 +17,7 @@ from varpin.model.equalities import prefixed
 from varpin.model.loading import transform
 from varpin.model.mimic import rebuild
 from varpin.model.robot import Part, Robot
+from varpin.support.checks import tuple_of
 
 logger = logging.getLogger(__name__)
 
@@ -49,12 +51,12 @@ def combine(
         raise InputError("combine takes two or more robots, as varpin.load_robot returns them")
     if placements is None:
         placements = [None] * len(robots)
-    if isinstance(placements, str | pin.SE3) or len(placements) != len(robots):
+    if not np.iterable(placements) or len(placements := tuple(placements)) != len(robots):
         raise InputError(f"placements must be one for each of {len(robots)} robots")
     if any(isinstance(place, str) for place in placements):
         raise InputError("placements must be transforms; for a moving base, load the robot with base='planar'")
-    given = _prefixes(robots) if prefixes is None else tuple(prefixes)
-    if isinstance(prefixes, str) or len(given) != len(robots) or not all(isinstance(word, str) for word in given):
+    given = _prefixes(robots) if prefixes is None else tuple_of("prefixes", prefixes, str)
+    if len(given) != len(robots):
         raise InputError(f"prefixes must be one string for each of {len(robots)} robots, got {prefixes!r}")
     if twice := _twice(robots, given):
         raise InputError(f"with the prefixes {given} there are two joints or frames named {twice[0]!r}")
@@ -63,7 +65,7 @@ def combine(
     if any((robot.model.gravity.linear != model.gravity.linear).any() for robot in robots):
         logger.warning("robots of different gravity are combined: that of %r is the default of scenes", robots[0].name)
     places = [
-        None if place is None else transform(place, f"placement of {robot.name!r}")
+        None if place is None else transform(place, f"placements: that of {robot.name!r}")
         for robot, place in zip(robots, placements, strict=True)
     ]
     parts = tuple(map(Part, robots, given, places))

@@ -139,8 +139,6 @@ class Payload:
 def carry(model: pin.Model, payload: Sequence[Payload], robot: str) -> None:
     """Add payloads to the links of ``model``."""
     for part in payload:
-        if not isinstance(part, Payload):
-            raise InputError(f"payload must be a varpin.Payload or a sequence of them, got {type(part).__name__}")
         frame = model.frames[frame_index(model, part.frame, robot)]
         if frame.parentJoint == 0:
             raise InputError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
@@ -27,6 +27,7 @@ from varpin.support.checks import (
     finite,
     require_finite,
     rotation_matrix,
+    tuple_of,
     word,
 )
 
@@ -130,7 +131,7 @@ def unchecked_robot(
     if inertia == "meshes":
         robot = with_mesh_inertias(robot, density)
     robot = _on_base(robot, base)
-    carry(robot.model, (payload,) if isinstance(payload, Payload) else payload, robot.name)
+    carry(robot.model, tuple_of("payload", payload, Payload), robot.name)
     names = list(robot.model.names)
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise RobotError(f"robot {robot.name!r} has several joints named {', '.join(map(repr, twice))}")
@@ -193,9 +194,7 @@ def _locks(robot: Robot, lock: Mapping[str, ArrayLike] | None, keep: Sequence[st
     given = dict(lock or {})
     if keep is None:
         return given
-    if isinstance(keep, str | Mapping) or not isinstance(keep, Iterable):
-        raise InputError(f"keep must be a list of joint names, got {keep!r}")
-    keep, model = tuple(keep), robot.model
+    keep, model = tuple_of("keep", keep, str), robot.model
     leaders = {model.names[tie.follower]: model.names[tie.leader] for tie in robot.ties}
     for name in keep:
         if name not in joint_index(model):

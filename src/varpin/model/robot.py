@@ -182,7 +182,7 @@ class Robot(Frozen):
         q = joint_array("others", others, self.joint_names, uniform=True)
         found = [state for state in self.group_states if name in (state.name, f"{state.group}/{state.name}")]
         if not found:
-            raise UnknownPosture(name, self.postures, f"robot {self.name!r} has no posture")
+            raise UnknownPosture(str(name), self.postures, f"robot {self.name!r} has no posture")
         positions: dict[str, float] = {}
         for joint, position in (entry for state in found for entry in state.positions):
             if joint in self.joint_names:
@@ -200,14 +200,19 @@ class Robot(Frozen):
         Raises:
             InputError: The last dimension of ``q`` is not n.
         """
-        q = as_floats("q", q)
-        if q.shape[-1:] != (self.dof,):
-            raise InputError(f"q must have shape (..., {self.dof}), got {q.shape}")
-        return to_pinocchio(self.model, q[..., self.tree.coordinate] * self.tree.ratio + self.tree.offset)
+        joints = self._rows("q", q)[..., self.tree.coordinate]
+        return to_pinocchio(self.model, joints * self.tree.ratio + self.tree.offset)
 
     def velocity(self, v: ArrayLike) -> Floats:
-        """``v`` (..., n) as velocities (..., model.nv) of ``model``: linear in v."""
-        return np.asarray(v, dtype=float)[..., self.tree.coordinate] * self.tree.ratio
+        """``v`` (..., n) as velocities (..., model.nv) of ``model``: linear in v; errors as :meth:`configuration`."""
+        return self._rows("v", v)[..., self.tree.coordinate] * self.tree.ratio
+
+    def _rows(self, name: str, values: ArrayLike) -> Floats:
+        """``values`` (..., n) as floats."""
+        given = as_floats(name, values)
+        if given.shape[-1:] != (self.dof,):
+            raise InputError(f"{name} must have shape (..., {self.dof}), got {given.shape}")
+        return given
 
     @property
     def end_effector(self) -> str:
@@ -217,17 +222,15 @@ class Robot(Frozen):
         return str([frame.name for frame in self.model.frames if frame.parentJoint == last][-1])
 
     def frame_positions(self, q: ArrayLike, frame: str | None = None) -> Floats:
-        """World positions [m] of a frame, or of :attr:`end_effector`: (N, 3) for ``q`` (N, n), (3,) for ``q`` (n,).
+        """World positions (..., 3) [m] of a frame, or of :attr:`end_effector`, at ``q`` (..., n).
 
         Raises:
-            InputError: ``q`` is neither (N, n) nor (n,), or there is no such frame.
+            InputError: The last dimension of ``q`` is not n, or there is no such frame.
         """
-        q = as_floats("q", q)
-        if q.ndim not in (1, 2) or q.shape[-1] != self.dof:
-            raise InputError(f"q must have shape (N, {self.dof}) or ({self.dof},), got {q.shape}")
+        q = self._rows("q", q)
         name = self.end_effector if frame is None else frame
         body, _, place = place_of_frame(self.model, name, self.name)
-        positions = place_on_body(self.tree, np.atleast_2d(q), body, place)
+        positions = place_on_body(self.tree, q.reshape(-1, self.dof), body, place)
         return np.asarray(positions.reshape(*q.shape[:-1], 3), dtype=np.float64)
 
     @property

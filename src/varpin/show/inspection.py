@@ -28,7 +28,7 @@ from varpin.model.robot import limits_of
 from varpin.model.tree import is_unbounded, joint_axis
 from varpin.model.urdf import listed
 from varpin.support import markup
-from varpin.support.checks import JointValues, joint_array
+from varpin.support.checks import JointValues, flag, joint_array
 from varpin.support.frozen import Frozen
 from varpin.support.tables import Table
 
@@ -274,7 +274,10 @@ def inspect_robot(
         raise RobotError(f"robot {robot.name!r} cannot be inspected: its mass matrix or its derivatives are not finite")
     margin = Guard().branch_margin
     condition = _condition_number(jet.Lvv)
-    links, (shapes, unread) = _links(robot), readable_geometry(robot) if meshes else (pin.GeometryModel(), {})
+    links, (shapes, unread) = (
+        _links(robot),
+        readable_geometry(robot) if flag("meshes", meshes) else (pin.GeometryModel(), {}),
+    )
     warnings = [
         *(*robot.faults, *robot.remarks, *robot.notes, *robot.limit_remarks()),
         *one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links, shapes))),

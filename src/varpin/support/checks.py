@@ -6,6 +6,7 @@ import inspect
 import math
 import os
 import reprlib
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from numbers import Real
@@ -60,12 +61,12 @@ def tuple_of(name: str, given: Any, kind: type, note: str = "") -> tuple[Any, ..
     """
     found = (given,) if isinstance(given, kind) and kind is not str else given
     wanted = f"{name} must be a list" if kind is str else f"{name} must be a list of varpin's {name}"
-    if isinstance(found, str) or not np.iterable(found):
+    if isinstance(found, str | Mapping) or not np.iterable(found):
         raise InputError(f"{wanted}, got {reprlib.repr(given)}{note}")
     items = tuple(found)
     for item in items:
         if not isinstance(item, kind):
-            raise InputError(f"{wanted}, got {item!r} in it{note}")
+            raise InputError(f"{wanted}, got {reprlib.repr(item)} in it{note}")
     return items
 
 
@@ -139,8 +140,9 @@ def named_limits(
     """(lower, upper), each one number, (size,) or by the names of ``joints``, as (2, size); infinite for no limit."""
     pair: Any = (-np.inf, np.inf) if limits is None else limits
     if not (isinstance(pair, tuple | list | np.ndarray) and np.iterable(pair)) or len(pair) != 2:
-        both_sides = f"; for +-{limits:g} write (-{limits:g}, {limits:g})" if isinstance(limits, int | float) else ""
-        raise InputError(f"{name} must be a pair (lower, upper), got {limits!r}{both_sides}")
+        one = reprlib.repr(limits)
+        both_sides = f"; for +-{one} write (-{one}, {one})" if isinstance(limits, int | float) else ""
+        raise InputError(f"{name} must be a pair (lower, upper), got {one}{both_sides}")
     both = np.empty((2, size))
     for row, side, value, none in zip(both, ("lower", "upper"), pair, (-np.inf, np.inf), strict=True):
         what = f"{name}: {side}"
@@ -262,23 +264,29 @@ def word(name: str, value: object, words: tuple[str, ...]) -> None:
     """Raise an InputError unless ``value`` is one of ``words``."""
     if not is_one_of(value, words):
         given = ", ".join(map(repr, words[:-1]))
-        raise InputError(f"{name} must be {given} or {words[-1]!r}, got {value!r}")
+        raise InputError(f"{name} must be {given} or {words[-1]!r}, got {reprlib.repr(value)}")
 
 
 def count(name: str, value: Any, least: int = 0) -> int:
     """``value`` as an int >= ``least``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise InputError(f"{name} must be an integer, got {value!r}")
-    if value < least:
-        raise InputError(f"{name} must be at least {least}, got {value}")
+        raise InputError(f"{name} must be an integer, got {reprlib.repr(value)}")
+    if not least <= value <= sys.maxsize:
+        raise InputError(f"{name} must be at least {least}, and at most {sys.maxsize}, got {reprlib.repr(value)}")
     return int(value)
 
 
 def flag(name: str, value: Any) -> bool:
     """``value`` as a bool; a text such as "no" would count as True."""
     if not isinstance(value, bool | np.bool_):
-        raise InputError(f"{name} must be True or False, got {value!r}")
+        raise InputError(f"{name} must be True or False, got {reprlib.repr(value)}")
     return bool(value)
+
+
+def require_function(name: str, value: object, arguments: str, *, optional: bool = False) -> None:
+    """Refuse anything but a function of ``arguments``, or None where it is ``optional``."""
+    if not (callable(value) or (optional and value is None)):
+        raise InputError(f"{name} must be a function of {arguments}, got {reprlib.repr(value)}")
 
 
 def path_like(name: str, path: Any) -> Path:
@@ -338,4 +346,4 @@ def told_motion(name: str, function: object, arguments: str, motion: str = "") -
     if motion and callable(function) and takes(function, least + 1):
         return True
     more = f", or of ({arguments}, {motion})" if motion else ""
-    raise InputError(f"{name} must be a function of ({arguments}){more}; got {function!r}")
+    raise InputError(f"{name} must be a function of ({arguments}){more}; got {reprlib.repr(function)}")

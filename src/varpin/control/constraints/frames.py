@@ -34,10 +34,8 @@ class _OfFrame(PlanConstraint):
 
     def _take(self, robot: Robot, frame: str) -> None:
         self.robot = require_robot(robot, type(self).__name__)
-        if not isinstance(frame, str):
-            raise InputError(f"{type(self).__name__} frame must be the name of a frame, got {frame!r}")
-        self.frame = frame
         self.kinematics = frame_kinematics(robot, frame)
+        self.frame = frame
 
     @property
     def label(self) -> str:

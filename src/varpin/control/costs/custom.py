@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.control.costs.base import BoundCost, Cost, CostError, Expansion, Points
-from varpin.errors import InputError
-from varpin.support.checks import as_floats, finite_array
+from varpin.support.checks import as_floats, finite_array, require_function
 
 Function = Callable[[Floats, Floats, Floats, Floats], ArrayLike]
 Derivatives = Callable[[Floats, Floats, Floats, Floats], tuple[ArrayLike, ArrayLike]]
@@ -50,9 +49,8 @@ class CustomCost(Cost):
 
     def __post_init__(self) -> None:
         for name in ("function", "derivatives"):
-            value = getattr(self, name)
-            if not callable(value) and (value is not None or name == "function"):
-                raise InputError(f"{self.name} {name} must be a function of (t, q, v, u), got {value!r}")
+            value, optional = getattr(self, name), name == "derivatives"
+            require_function(f"{self.name} {name}", value, "(t, q, v, u)", optional=optional)
 
     def _text(self) -> str:
         function = getattr(self.function, "__name__", type(self.function).__name__)

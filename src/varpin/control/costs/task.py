@@ -24,7 +24,7 @@ from varpin.core import Subject
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
 from varpin.model.kinematics import FrameKinematics, Links, frame_kinematics, mass_carriers, require_same
-from varpin.support.checks import positive, rotation_matrix
+from varpin.support.checks import positive, rotation_matrix, tuple_of
 
 
 class _TaskCost(LeastSquares):
@@ -38,16 +38,11 @@ class _TaskCost(LeastSquares):
     shape: tuple[int, ...] = (3,)  # of a constant target
     _of: FrameKinematics | Links
 
-    def _take(self, robot: Robot, frame: str | None, target: ReferenceValues, weight: ArrayLike) -> None:
+    def _take(self, robot: Robot, target: ReferenceValues, weight: ArrayLike, **of: str) -> None:
         name = type(self).__name__
         self.robot = require_robot(robot, name)
-        if frame is None:
-            self._of = mass_carriers(robot)
-        elif isinstance(frame, str):
-            self.frame = frame
-            self._of = frame_kinematics(robot, frame)
-        else:
-            raise InputError(f"{name} frame must be the name of a frame, got {frame!r}")
+        vars(self).update(of)
+        self._of = frame_kinematics(robot, **of) if of else mass_carriers(robot)
         self.weight = checked_weight(name, weight)
         weight_matrix(name, self.weight, self.shape[0])
         self.target = checked_reference(name, target)
@@ -80,7 +75,7 @@ class _FrameCost(_TaskCost):
             UnknownFrame: The robot has no such frame.
             InputError: The frame is fixed to the base, or a weight is no such weight.
         """
-        self._take(robot, frame, target, weight)
+        self._take(robot, target, weight, frame=frame)
 
 
 class FramePositionCost(_FrameCost):
@@ -112,8 +107,8 @@ class FrameOrientationCost(_FrameCost):
             raise
         return replace(bound, target=bound.target.reshape(-1, 9))
 
-    def _take(self, robot: Robot, frame: str | None, target: ReferenceValues, weight: ArrayLike) -> None:
-        super()._take(robot, frame, target, weight)
+    def _take(self, robot: Robot, target: ReferenceValues, weight: ArrayLike, **of: str) -> None:
+        super()._take(robot, target, weight, **of)
         if isinstance(self.target, np.ndarray) and self.target.shape[-2:] == (3, 3):
             _require_rotations(self.target.reshape(-1, 3, 3))
 
@@ -146,7 +141,7 @@ class CenterOfMassCost(_TaskCost):
         Raises:
             InputError: The links have no mass, or a weight is no such weight.
         """
-        self._take(robot, None, target, weight)
+        self._take(robot, target, weight)
 
 
 _DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
@@ -186,10 +181,11 @@ class ManipulabilityCost(_TaskCost):
             InputError: More directions than coordinates, of which one is always impossible; or as for the others.
         """
         self.least = positive("ManipulabilityCost least", least, "m or rad for each direction")
-        self._take(robot, frame, self.least, weight)
+        self._take(robot, self.least, weight, frame=frame)
         if self.weight.ndim:
             raise InputError(f"ManipulabilityCost weight must be one number, got shape {self.weight.shape}")
-        chosen = _SETS.get(directions, ()) if isinstance(directions, str) else tuple(directions)
+        names = _SETS.get(directions, ()) if isinstance(directions, str) else directions
+        chosen = tuple_of("ManipulabilityCost directions", names, str)
         if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= set(_DIRECTIONS):
             raise InputError(
                 "ManipulabilityCost directions must be 'all', 'linear', 'angular' or some of "
