@@ -115,3 +115,11 @@ def random_tree(
     if armature:
         model.armature = rng.uniform(0.0, 0.1, model.nv)
     return model
+
+
+def mass_matrix(robot: vp.Robot, q: np.ndarray, data: pin.Data) -> np.ndarray:
+    """M(q) (n, n) by Pinocchio's composite rigid body algorithm, armature included [kg m^2, kg m or kg]."""
+    full = pin.crba(robot.model, data, robot.configuration(q))
+    full = np.triu(full) + np.triu(full, 1).T
+    G = robot.velocity(np.eye(robot.dof)).T
+    return G.T @ full @ G

@@ -162,7 +162,7 @@ def test_names_that_clash_get_a_prefix(arms):
         (["ur5"], {}, "robots"),
         (2, {"placements": [None]}, ("placements", "2")),
         (2, {"placements": [None, "planar"]}, "base="),
-        (2, {"placements": [None, [2.0, 0.0, 0.0]]}, ("placement", "'chain2'")),
+        (2, {"placements": [None, [2.0, 0.0, 0.0]]}, ("placements", "'chain2'")),
         (2, {"placements": [None, 2.0 * np.eye(4)]}, "rotation"),
         (2, {"prefixes": "ab"}, "prefixes"),
         (2, {"prefixes": ["", ""]}, "'joint1'"),
