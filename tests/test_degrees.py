@@ -131,17 +131,20 @@ def test_stops_in_degrees(caplog):
             lambda r, k: vp.KeepClear(
                 r, [vp.Obstacle.sphere(k * np.array([0.9, 0.5, 0.4]), 0.1, "ball")], links=["forearm_link"]
             ),
-            "'ball'",
+            "ball is",
         ),
         (
             lambda r, k: vp.KeepClear(r, [vp.Obstacle.sphere([2.0, 0.5, 0.4], 0.1)], k * 0.1, links=["forearm_link"]),
-            "KeepClear: distance",
+            "KeepClear: the distance",
         ),
         (
             lambda r, k: vp.KeepOutOfSphere(r, "tool0", k * np.array([0.9, 0.3, 0.4]), 0.1),
-            "KeepOutOfSphere: the distance",
+            "KeepOutOfSphere('tool0'): the distance",
         ),
-        (lambda r, k: vp.KeepInHalfSpace(r, "tool0", [0.0, 0.0, 1.0], k * -0.3), "KeepInHalfSpace: offset"),
+        (
+            lambda r, k: vp.KeepInHalfSpace(r, "tool0", [0.0, 0.0, 1.0], k * -0.3),
+            "KeepInHalfSpace('tool0'): the distance",
+        ),
     ],
 )
 def test_millimetres_in_obstacles_and_regions(scene, make, named, scale):

@@ -8,7 +8,7 @@ from refusals import naming
 from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_lyapunov
 
 import varpin as vp
-from varpin.control.problem import integrator_for
+from varpin.simulation.choice import integrator_for
 
 HELD = [vp.Midpoint(kick="held"), vp.Gauss(2, kick="held"), vp.Radau(2, kick="held")]
 

@@ -12,9 +12,9 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import varpin as vp
 from varpin.control import ViolationOnRobot
-from varpin.control.checks import foreseen, reach
+from varpin.control.checks import foreseen
 from varpin.model.clearance import capsule_around, clearance
-from varpin.model.kinematics import frame_kinematics
+from varpin.model.kinematics import frame_kinematics, reach
 
 
 def two_links(constraints=(), *, steps=24, cost=None, **options):
