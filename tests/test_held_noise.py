@@ -8,7 +8,7 @@ from oracles import slope
 from refusals import naming
 
 import varpin as vp
-from varpin.control.problem import integrator_for
+from varpin.simulation.choice import integrator_for
 
 HELD = [vp.Midpoint(kick="held"), vp.Gauss(2, kick="held"), vp.Radau(2, kick="held")]
 

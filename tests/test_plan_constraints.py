@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import varpin as vp
 from varpin.control import ViolationOnRobot, checks
+from varpin.model import kinematics as places_of
 from varpin.model.kinematics import frame_kinematics
 
 
@@ -203,7 +204,7 @@ def test_reach_bounds_where_a_frame_gets(name):
     places = kinematics.placements(q)[1]
     root = kinematics.links.tree.translation[0]
     away = np.linalg.norm(places - root, axis=1)
-    most = checks.reach(robot, kinematics)
+    most = places_of.reach(robot, kinematics)
     assert away.max() <= most < 1.4 * away.max()
     farthest = places[away.argmax()]
     scene = vp.Scene(robot)

@@ -9,7 +9,7 @@ from mechanisms import random_tree
 from refusals import refused
 
 import varpin as vp
-from varpin.control.solution_file import solution_trajectory
+from varpin.control import solution_trajectory
 
 UR5 = {"damping": 0.1, "stiffness": 2.0, "rest": 0.3, "noise": vp.AdditiveNoise(1e-3)}
 PUSH = vp.FrameWrench("tool0", [3.0, -2.0, 5.0, 0.0, 0.0, 0.0])

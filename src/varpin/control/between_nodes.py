@@ -15,6 +15,7 @@ import numpy as np
 from varpin.arrays import Floats, Integers, Mask
 from varpin.control.constraints import BoundConstraint, Horizon, PlanConstraint
 from varpin.control.problem import OptimalControlProblem
+from varpin.control.sizes import FEASIBLE, SLIGHT
 from varpin.errors import LinearizationError
 from varpin.io.archive import Axes
 from varpin.mechanics.custom import CustomForceError
@@ -23,19 +24,10 @@ from varpin.signals.commands import cubics, open_loop
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
 
-# Parts of a step in which motions are looked at.
-_PARTS = 8
-# Violation of the start from which on a constraint cannot hold in the first step.
-_OUTSIDE = 1e-6
-# Distance in steps within which an instant is that of a peak: what it misses of it is of second order.
-_SAME = 1e-3
+# Parts of a step in which motions are looked at; from 4 to 16.
+PARTS = 8
 # Differences of states and controls; from 1e-7 to 1e-5.
 _SHIFT = 1e-6
-# Distance of a peak from its bound up to which it gets rows, too, relative to the constraint's scale.
-_NEAR = 1e-3
-# Violation between nodes from which rows are added: where the problem asks for them, and in tenths of a constraint's
-# range with linear controls, which lead around nodes.
-_BETWEEN, _SHARE = 1e-6, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +144,6 @@ def enforced(problem: OptimalControlProblem, instants: Instants) -> OptimalContr
     """The problem with further bound constraints, one for each constraint with rows at ``instants``."""
     if not len(instants.rows):
         return problem
-    made = object.__new__(type(problem))
     found = list(problem.bound_constraints)
     for i in instants.constraints:
         item, steps, moments = problem.bound_constraints[i], *instants.of(i)
@@ -161,14 +152,12 @@ def enforced(problem: OptimalControlProblem, instants: Instants) -> OptimalContr
         ends = None if instants.cubic else at_times(problem, item.source, _times(problem, steps))
         given = item.source, steps + 1, times, item.rows, item.unit, item.scale
         found.append(BoundBetween(*given, problem, moments, inner, ends))
-    # The dataclass is frozen: attributes are set in its dictionary.
-    vars(made).update(vars(problem) | {"bound_constraints": tuple(found)})
-    return made
+    return problem.changed(bound_constraints=tuple(found))
 
 
 def _times(problem: OptimalControlProblem, steps: Integers) -> Floats:
     """Times [s] of all ends of parts of steps."""
-    found: Floats = problem.t0 + problem.dt * (steps[:, None] + np.arange(_PARTS + 1) / _PARTS).ravel()
+    found: Floats = problem.t0 + problem.dt * (steps[:, None] + np.arange(PARTS + 1) / PARTS).ravel()
     return found
 
 
@@ -210,12 +199,12 @@ def followed(problem: OptimalControlProblem, instants: Instants, motion: Traject
     for i, near in _seen(problem, motion).items():
         scale, (places, values, there) = problem.bound_constraints[i].scale, _peaks(near)
         beyond = np.where(there, values + backoff[i][:, None], -np.inf)
-        violated |= bool((beyond > (_BETWEEN if problem.between_nodes else _SHARE * scale)).any())
+        violated |= bool((beyond > (FEASIBLE if problem.between_nodes else SLIGHT * scale)).any())
         # Known ones stay where they are: the search could go on for ever between some that moved.
         own = [(i, step, moment) for step, moment in zip(*(part.tolist() for part in instants.of(i)), strict=True)]
-        for step, part, row in np.argwhere(beyond > -_NEAR * scale):
+        for step, part, row in np.argwhere(beyond > -SLIGHT * scale):
             at = float(places[step, part, row])
-            if not any(other == step and abs(at - moment) <= _SAME for _, other, moment in own):
+            if not any(other == step and abs(at - moment) <= SLIGHT for _, other, moment in own):
                 own.append((i, int(step), at))
         found += sorted(own)
     if not violated or len(found) == len(instants.rows):
@@ -235,12 +224,12 @@ def _in_parts(problem: OptimalControlProblem, given: Floats) -> tuple[Floats, Fl
     """
     n, m = problem.scene.robot.dof, problem.scene.controls
     q, v, u = (part.copy() for part in np.split(given, [n, 2 * n], axis=1))
-    commands = open_loop(u[:, -m:])._replace(hold=_PARTS, own=1)
+    commands = open_loop(u[:, -m:])._replace(hold=PARTS, own=1)
     if problem.linear:
         times = np.array(problem.integrator.stage_times or (0.5,))
         commands = commands._replace(before=u[:, :m].copy(), stage_times=times)
     try:
-        found = problem.integrator.motions(quiet(problem.scene), q, v, commands, problem.dt / _PARTS)
+        found = problem.integrator.motions(quiet(problem.scene), q, v, commands, problem.dt / PARTS)
     except CustomForceError:
         return None
     if found is None:
@@ -268,17 +257,17 @@ def _seen(problem: OptimalControlProblem, motion: Trajectory) -> dict[int, Float
     times, found = _times(problem, steps), {}
     for i, (item, looks) in enumerate(zip(problem.bound_constraints, watched(problem), strict=True)):
         if looks:
-            found[i] = at_times(problem, item.source, times).value(q, v, u).reshape(len(steps), _PARTS + 1, -1)
-            if (found[i][0, 0] > _OUTSIDE).any():
+            found[i] = at_times(problem, item.source, times).value(q, v, u).reshape(len(steps), PARTS + 1, -1)
+            if (found[i][0, 0] > FEASIBLE).any():
                 found[i][0] = -np.inf
     return found
 
 
 def _on_parabolas(near: Floats, moments: Floats) -> Floats:
     """Values (S, K, rows) at moments (K,) of steps from those at the ends of their parts (S, K, parts + 1, rows)."""
-    middle = np.clip(np.rint(_PARTS * moments), 1, _PARTS - 1).astype(np.int64)
+    middle = np.clip(np.rint(PARTS * moments), 1, PARTS - 1).astype(np.int64)
     before, here, after = (near[:, np.arange(len(moments)), middle + k] for k in (-1, 0, 1))
-    x = (_PARTS * moments - middle)[:, None]
+    x = (PARTS * moments - middle)[:, None]
     found: Floats = here + 0.5 * x * (after - before) + 0.5 * x**2 * (after - 2.0 * here + before)
     return found
 
@@ -290,7 +279,7 @@ def _peaks(near: Floats) -> tuple[Floats, Floats, Mask]:
     """
     before, here, after = near[:, :-2], near[:, 1:-1], near[:, 2:]
     # The first and the last one go on to the end of the step.
-    reach = np.full((2, _PARTS - 1, 1), 0.5)
+    reach = np.full((2, PARTS - 1, 1), 0.5)
     reach[0, 0] = reach[1, -1] = 1.0
     with np.errstate(invalid="ignore", divide="ignore"):
         bends = 2.0 * here - before - after
@@ -298,4 +287,4 @@ def _peaks(near: Floats) -> tuple[Floats, Floats, Mask]:
         there = np.isfinite(here) & (bends > 0.0) & (-reach[0] <= x) & (x < reach[1])
         x = np.where(there, x, 0.0)
         values = np.where(there, here + 0.25 * x * (after - before), here)
-    return (np.arange(1, _PARTS)[:, None] + x) / _PARTS, values, there
+    return (np.arange(1, PARTS)[:, None] + x) / PARTS, values, there

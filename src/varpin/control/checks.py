@@ -11,41 +11,30 @@ from typing import Any
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.constraints import (
-    KeepClear,
-    KeepInBox,
-    KeepInHalfSpace,
-    KeepInSphere,
-    KeepOutOfSphere,
-    PlanConstraint,
-    ReachFrame,
-    WithinJointLimits,
-)
+from varpin.control.constraints import KeepInBox, ReachFrame, WithinJointLimits
 from varpin.control.costs import FramePositionCost, TrackingCost, weight_matrix
 from varpin.control.margins import too_small
-from varpin.control.multipliers import FEASIBLE, REPORTED
-from varpin.control.noise import covariances, noise_cost
+from varpin.control.noise import noise_cost
 from varpin.control.problem import OptimalControlProblem
+from varpin.control.sizes import FEASIBLE, HARMLESS, NOTABLE, SLIGHT, TRACE
 from varpin.control.solution import Solution
 from varpin.control.stages import Feedback, Steps
-from varpin.control.verification import CLEAR, Played, at_start, excess, in_parts, percent, replays
+from varpin.control.verification import Played, at_start, excess, in_parts, percent, replays
 from varpin.errors import VarpinError
 from varpin.finding import Finding, announce, ranked
-from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import closest_controls
 from varpin.model import (
     ADVICE,
     AFAR,
     ASIDE,
     IN_MILLIMETRES,
-    Robot,
     degrees_hint,
     joint_unit,
     longest_reach,
     looks_like_degrees,
     millimetres_hint,
 )
-from varpin.model.kinematics import FrameKinematics, frame_kinematics
+from varpin.model.kinematics import frame_kinematics, reach
 from varpin.simulation.check import check
 from varpin.simulation.record import rollout
 from varpin.simulation.start import in_other_units
@@ -53,15 +42,8 @@ from varpin.simulation.velocity_noise import wrong_spread
 
 logger = logging.getLogger(__name__)
 
-# Parts of a step in which a plan is played again.
-PARTS = 4
-# Greatest relative excess over the plan's cost in parts of its steps without a warning; of a shortfall it is CLEAR, as
-# of the torque that holds a posture which limits may be short of.
-LOSS = 1e-3
-# Part of the expected cost by which noise may cost other than planned in half steps without a warning.
-_NOISE_OFF = 0.02
-# Standard deviation of a velocity, in widths of its dry friction, up to which tanh is linear to 6 %.
-_LINEAR_FRICTION = 0.25
+# Parts of a step in which a plan is played again; from 2 to 8.
+_PARTS = 4
 # Angle of a swing under gravity from which on no step follows it [rad]: a quarter of a period.
 _QUARTER = 0.5 * np.pi
 
@@ -86,9 +68,9 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
         found.append(Finding("true cost", solution.refinement.reason))
     found += _noise(solution)
     try:
-        again = replays(problem, solution.controls, solution.policy_on, problem.integrator, PARTS)
+        again = replays(solution, problem.integrator, _PARTS)
     except VarpinError as error:
-        return *found, Finding("replay", f"the plan cannot be replayed in steps of {1.0 / PARTS:g} dt: {error}")
+        return *found, Finding("replay", f"the plan cannot be replayed in steps of {1.0 / _PARTS:g} dt: {error}")
     found += _between(solution, again)
     # A plan that is as true as it was wished to be has been looked at already.
     if not met and (dearer := _dearer(solution, again)):
@@ -124,7 +106,7 @@ def _starts_outside(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Constraints that the start violates, so that the first step has to satisfy them."""
     for bound in problem.bound_constraints:
         c = at_start(problem, bound)
-        if c is not None and c[row := int(np.argmax(c))] > REPORTED * bound.scale:
+        if c is not None and c[row := int(np.argmax(c))] > NOTABLE * bound.scale:
             sentence = (
                 f"the start is outside {problem.label_of(bound.source)}, {bound.rows[row]} by {c[row]:.2g} "
                 f"{bound.unit}, and the first node has to be inside: begin inside, or widen the bound"
@@ -138,7 +120,7 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
     for term in problem.cost.terms:
         if isinstance(term, FramePositionCost) and not callable(term.target):
             strengths, axes = np.linalg.eigh(weight_matrix("FramePositionCost", term.weight, 3))
-            weighed = axes[:, strengths > FEASIBLE * strengths[-1]]
+            weighed = axes[:, strengths > TRACE * strengths[-1]]
             places.append((f"FramePositionCost({term.frame!r})", term.frame, weighed, term.target))
     for goal in problem.constraints:
         if isinstance(goal, ReachFrame) and goal.position is not None:
@@ -147,35 +129,13 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
         kinematics = frame_kinematics(robot, frame)
         most, root = reach(robot, kinematics), kinematics.links.tree.translation[0]
         away = float(np.linalg.norm((np.atleast_2d(place) - root) @ axes, axis=1).max())
-        if away > most * (1.0 + FEASIBLE):
+        if away > most * (1.0 + TRACE):
             far = away > AFAR * most
             sentence = (
                 f"{label} has its goal {away:.4g} m from the first joint, and the frame gets {most:.4g} m from there "
                 f"at most: {IN_MILLIMETRES if far else 'no motion gets there'}"
             )
             yield Finding("goal in millimetres" if far else "goal out of reach", sentence)
-
-
-def reach(robot: Robot, frame: FrameKinematics) -> float:
-    """Upper bound on a frame's distance from its first joint [m]; infinite on free rails.
-
-    It is the shortest chain of hops from joint to joint, or over one revolute joint to the next but one.
-    """
-    links = frame.links.tree
-    hops = [*links.translation[1:], frame.translation]
-    lower, upper = robot.position_limits
-    ends = np.array([lower, upper])[:, links.coordinate]
-    slides = np.where(links.prismatic, np.abs(links.ratio * ends + links.offset).max(axis=0), 0.0)
-    most = [0.0]
-    for k, hop in enumerate(hops):
-        ways = [most[k] + slides[k] + np.linalg.norm(hop)]
-        if k > 0 and not links.prismatic[k]:
-            # Turned about joint k, the hop leads farthest away where it points away from its axis as the one before.
-            before = links.rotation[k].T @ hops[k - 1]
-            across = np.hypot(*before[:2]) + np.hypot(*hop[:2])
-            ways.append(most[k - 1] + slides[k - 1] + np.hypot(across, before[2] + hop[2]))
-        most.append(float(min(ways)))
-    return most[-1]
 
 
 def _postures(problem: OptimalControlProblem) -> Iterator[Floats]:
@@ -186,14 +146,12 @@ def _postures(problem: OptimalControlProblem) -> Iterator[Floats]:
             yield end
 
 
-def _limits(problem: OptimalControlProblem) -> list[WithinJointLimits]:
-    return [item for item in problem.constraints if isinstance(item, WithinJointLimits)]
-
-
 def _outside(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Goal configurations outside of joint limits."""
     robot = problem.scene.robot
-    for end, own in itertools.product(_postures(problem), _limits(problem)):
+    for end, own in itertools.product(_postures(problem), problem.constraints):
+        if not isinstance(own, WithinJointLimits):
+            continue
         beyond = np.maximum(end - own.limits[1], own.limits[0] - end)
         joint = int(np.argmax(beyond))
         if beyond[joint] > FEASIBLE:
@@ -215,7 +173,7 @@ def _weights(problem: OptimalControlProblem) -> Iterator[Finding]:
         needed, (lower, upper) = closest_controls(scene, q), problem.control_limits
         beyond = np.maximum(needed - upper, lower - needed)
         joint = int(np.argmax(beyond))
-        if beyond[joint] > CLEAR * abs(needed[joint]):
+        if beyond[joint] > NOTABLE * abs(needed[joint]):
             sentence = (
                 f"control limits cannot hold the arm at rest at {where}: joint {names[joint]!r} needs "
                 f"{needed[joint]:.3g}, and its limits are {lower[joint]:.3g} and {upper[joint]:.3g}"
@@ -229,7 +187,9 @@ def _in_degrees(problem: OptimalControlProblem) -> Iterator[Finding]:
     for end in _postures(problem):
         if sentence := degrees_hint(robot, "the goal of the terminal TrackingCost", end):
             yield Finding("goal in degrees", sentence)
-    for own in _limits(problem):
+    for own in problem.constraints:
+        if not isinstance(own, WithinJointLimits):
+            continue
         # Limits of the robot's description are in radians, however wide.
         given = np.isfinite(own.limits) & (own.limits != robot.position_limits) & ~robot.slides
         most = np.where(given, np.abs(own.limits), 0.0).max(axis=0)
@@ -241,38 +201,18 @@ def _in_degrees(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 
 def _in_millimetres(problem: OptimalControlProblem) -> Iterator[Finding]:
-    """Obstacles and regions whose places or sizes look like millimetres."""
-    robot = problem.scene.robot
-    for constraint in problem.constraints:
-        lengths = {f"{type(constraint).__name__}: {name}": size for name, size in _lengths(constraint).items()}
-        sentence = millimetres_hint(robot, lengths) if lengths else ""
-        if isinstance(constraint, KeepClear) and not sentence:
-            sentence = millimetres_hint(robot, {"KeepClear: distance": abs(constraint.distance)}, ASIDE)
-        if sentence:
+    """Regions and obstacles that are so far away at the start, or violated by so much, that they look like it."""
+    for bound in problem.bound_constraints:
+        c = at_start(problem, bound) if bound.unit == "m" else None
+        if c is None or isinstance(bound.source, WithinJointLimits):
+            continue
+        order = np.argsort(np.abs(c))
+        # One far side of a box may stand for none.
+        row = order[len(order) // 2] if isinstance(bound.source, KeepInBox) else order[-1]
+        name = f"{problem.label_of(bound.source)}: the distance at the start from {bound.rows[row]}"
+        plausible = ASIDE if c[row] > 0.0 else AFAR
+        if sentence := millimetres_hint(problem.scene.robot, {name: abs(float(c[row]))}, plausible):
             yield Finding("places in millimetres", sentence)
-
-
-def _lengths(constraint: PlanConstraint) -> dict[str, float]:
-    """Names of a constraint's lengths, and their sizes [m]; places count by their distance from the robot's root."""
-    found: dict[str, float] = {}
-    if isinstance(constraint, KeepInSphere | KeepOutOfSphere):
-        found["radius"] = constraint.radius
-        if not callable(constraint.center):
-            root = constraint.robot.tree.translation[0]
-            found["the distance of its centre"] = float(np.linalg.norm(constraint.center - root))
-    elif isinstance(constraint, KeepInHalfSpace):
-        found["offset"] = abs(constraint.offset)
-    elif isinstance(constraint, KeepInBox):
-        # One far side may stand for none.
-        away = np.abs(constraint.limits[np.isfinite(constraint.limits)])
-        found["its nearest side"] = float(away[away > 0.0].min(initial=np.inf)) if away.any() else 0.0
-    elif isinstance(constraint, KeepClear):
-        for body in constraint.obstacles:
-            ends, sides = np.array([body.begin, body.end]), body.sides if body.hull is None else body.hull.sides
-            distances = np.linalg.norm(ends - constraint.robot.tree.translation[0], axis=1)
-            found[f"the obstacle {body.name!r}: its distance"] = float(distances.min())
-            found[f"the obstacle {body.name!r}: its radius or side"] = body.radius if sides is None else sides.max()
-    return found
 
 
 # The finished plan
@@ -283,14 +223,14 @@ def _dearer(solution: Solution, again: Sequence[Played]) -> Finding | None:
     problem = solution.problem
     first = np.inf if solution.search is None else abs(solution.search.first)
     # Where the optimum costs nothing, the excess is relative to the cost at stake at the beginning.
-    base = abs(solution.cost) + (1e-9 * first if np.isfinite(first) else 0.0)
+    base = abs(solution.cost) + (HARMLESS * first if np.isfinite(first) else 0.0)
     lost = [excess(base + own.cost - solution.cost, base) for own in again]
-    if -CLEAR <= lost[1] <= LOSS:
+    if -NOTABLE <= lost[1] <= SLIGHT:
         return None
     alone, fed = (percent(part) if np.isfinite(part) else "runs away" for part in lost)
-    advice = f"problem.at(dt={problem.dt / PARTS:g}, hold={problem.hold * PARTS}) decides as often in finer steps"
+    advice = f"problem.at(dt={problem.dt / _PARTS:g}, hold={problem.hold * _PARTS}) decides as often in finer steps"
     if problem.linear or problem.scene.inputs:
-        advice = f"problem.at(dt={problem.dt / PARTS:g}) has finer steps"
+        advice = f"problem.at(dt={problem.dt / _PARTS:g}) has finer steps"
     if problem.sampling != "gauss":
         advice = f"sampling='gauss' sees the motion within steps, {problem.sampling!r} does not"
     sentence = (
@@ -310,7 +250,7 @@ def _between(solution: Solution, again: Sequence[Played]) -> Iterator[Finding]:
     if np.isnan(away).all():
         return
     for bound, outside in zip(problem.bound_constraints, again[int(np.nanargmin(away))].outside, strict=True):
-        if bound.of_controls or bound.source.equality or outside.worst <= REPORTED * bound.scale:
+        if bound.of_controls or bound.source.equality or outside.worst <= NOTABLE * bound.scale:
             continue
         advice = "a smaller dt or a bound narrower by that much keeps it there"
         if not (problem.linear or problem.between_nodes):
@@ -328,49 +268,22 @@ def _between(solution: Solution, again: Sequence[Played]) -> Iterator[Finding]:
 
 def _noise(solution: Solution) -> Iterator[Finding]:
     """Findings about noise that the linear model of a plan does not have as it is."""
-    problem, motion = solution.problem, solution.trajectory
+    problem, motion, n = solution.problem, solution.trajectory, solution.problem.scene.robot.dof
     margins = [bound for bound in problem.bound_constraints if bound.source.margin > 0.0]
     if not problem.scene.processes:
         if margins:
             yield Finding("margin without noise", "a constraint has a margin=, but the scene has no noise: it is zero")
         return
-    n = problem.scene.robot.dof
     of_speeds = {own.source.label for own in margins if own.jacobian(motion.q, motion.v)[:, :, n:].any()}
-    if of_speeds:
-        for why in wrong_spread(problem.scene, problem.integrator, motion):
-            sentence = f"the margin= of {', '.join(sorted(of_speeds))} may be wrong: {why}"
-            yield Finding("margins of velocities", sentence)
+    for why in wrong_spread(problem.scene, problem.integrator, motion) if of_speeds else ():
+        sentence = f"the margin= of {', '.join(sorted(of_speeds))} may be wrong: {why}"
+        yield Finding("margins of velocities", sentence)
     yield from too_small(solution)
     # A custom noise or cost, or the linearization, may fail off the plan.
-    for look in (_friction, _in_halves):
-        try:
-            yield from look(solution)
-        except VarpinError as error:
-            logger.info("%s: %s", problem.scene.robot.name, error)
-
-
-def _friction(solution: Solution) -> Iterator[Finding]:
-    """A finding if noise moves a joint by more than its dry friction is linear for."""
-    problem, motion, n = solution.problem, solution.trajectory, solution.problem.scene.robot.dof
-    rubbing = of_kind(problem.scene.elements, "CoulombFriction")
-    if not rubbing:
-        return
-    steps = Steps(problem, motion)
-    of_speeds = steps.slopes[:, n:]
-    P = covariances(steps, Feedback(solution.gains, solution.previous_gains))
-    spread = np.sqrt(np.maximum(np.einsum("kvx,kxy,kvy->kv", of_speeds, P, of_speeds), 0.0))
-    joints, widths = [own.coordinate for own in rubbing], np.array([own.values[1] for own in rubbing])
-    # At speed dry friction is constant, and noise changes it little.
-    slow = np.abs(motion.v[:, joints]) < 3.0 * (widths + spread[:, joints])
-    ratios = np.where(slow, spread[:, joints] / widths, 0.0).max(axis=0)
-    worst = int(ratios.argmax())
-    if ratios[worst] > _LINEAR_FRICTION:
-        name, unit = motion.joint_names[joints[worst]], joint_unit(problem.scene.robot, joints[worst], speed=True)
-        sentence = (
-            f"noise moves joint {name!r} by {ratios[worst]:.2g} widths of its dry friction ({widths[worst]:g} {unit}), "
-            "which noise_cost, gains and margins take as linear: use plan.monte_carlo()"
-        )
-        yield Finding("friction under noise", sentence, name, value=float(ratios[worst]), unit="widths")
+    try:
+        yield from _in_halves(solution)
+    except VarpinError as error:
+        logger.info("%s: %s", problem.scene.robot.name, error)
 
 
 def _in_halves(solution: Solution) -> Iterator[Finding]:
@@ -382,13 +295,13 @@ def _in_halves(solution: Solution) -> Iterator[Finding]:
     if problem.scene.inputs:
         return
     fine, by = problem.in_parts(2), problem.integrator
-    commands = in_parts(problem, solution.controls, solution.policy_on, by, 2)[1]
+    commands = in_parts(solution, by, 2)[1]
     finer, failure = rollout(problem.scene, by, problem.q0, problem.v0, commands, fine.dt)
     if failure is not None:
         return
     planned = noise_cost(Steps(problem, solution.trajectory), feedback)
     cost = noise_cost(Steps(fine, finer), feedback, halves=problem.linear)
-    if abs(cost - planned) > _NOISE_OFF * (abs(solution.cost) + max(planned, cost)):
+    if abs(cost - planned) > NOTABLE * (abs(solution.cost) + max(planned, cost)):
         closer = f"problem.at(dt={fine.dt:g}{'' if problem.linear else f', hold={fine.hold}'})"
         sentence = (
             f"noise costs {cost:.3g} in half steps and {planned:.3g} in the plan's of dt = {problem.dt:g} s, as "

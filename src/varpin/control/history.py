@@ -7,9 +7,6 @@ from enum import Enum
 
 import numpy as np
 
-# Default number of iterations.
-ITERATIONS = 500
-
 
 class Status(Enum):
     """How a solver ended; the value explains it, with advice."""
@@ -139,7 +136,7 @@ class Refined:
         excess: Excess of the true cost over the optimum of finer controls, relative to the latter: an estimate
             from the plan with half the step. Infinite where it is not known.
         violation: Largest violation of a constraint on the continuous system with feedback, relative to the
-            constraint's range (for frames and clearance 1 m or 3 rad); NaN where that motion diverges.
+            constraint's range (for frames and clearance 1 m or rad); NaN where that motion diverges.
     """
 
     dt: float

@@ -1,7 +1,8 @@
-"""Margins by count: how often motions under noise violate a bound, and how wide its margin has to be, (O13)."""
+"""Margins of rows under noise, (O13): they follow the motion of a search, and counted motions widen them."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 from typing import NamedTuple
 
@@ -9,24 +10,34 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from varpin.arrays import Floats
+from varpin.control.between_nodes import NOWHERE, Instants
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import Status
-from varpin.control.monte_carlo import Paths, joined, simulated, with_margins
+from varpin.control.monte_carlo import Paths, found_by, joined, with_margins
 from varpin.control.multipliers import at_nodes, split
+from varpin.control.noise import deviations
+from varpin.control.problem import OptimalControlProblem
+from varpin.control.riccati import Plan
+from varpin.control.sizes import SLIGHT, TENTH
 from varpin.control.solution import Solution
+from varpin.control.stages import Feedback, Steps
 from varpin.errors import VarpinError
 from varpin.finding import Finding
 from varpin.mechanics.wiener import children
-from varpin.support.executors import executing, in_order
+from varpin.support.executors import executing
 
-# Motions that are counted, and those where only Python evaluates the noise: shares at margin 2 are then known to a
-# seventh and to a third of themselves. From 1000 on the margins differ by a few percent.
-_MOTIONS, _ALONE = 2048, 512
-# Motions beyond a quantile that determine it: its error is then a quarter of the share at most.
+# How often margins are widened by counting motions; from 2 to 5.
+_COUNTS = 3
+# Iterations in which margins follow the motion, and how often they do so later; from 10 to 50, and from 25.
+_FOLLOWING, _ROUNDS = 20, 30
+# Motions that are counted, and a quarter of them where only Python evaluates the noise: shares at margin 2 are then
+# known to a seventh and to a third of themselves. From 1000 on the margins differ by a few percent.
+_MOTIONS = 2048
+# Motions beyond a quantile that determine it: its error is then a quarter of the share at most; from 10 to 40.
 _ENOUGH = 20
-# Standard errors by which a share may exceed what is promised before a margin becomes wider, and before a warning,
-# where the worst of many rows is chosen.
-_CLEARLY, _DOUBT = 1.0, 3.0
+# Standard errors by which the worst of many shares may exceed what is promised before a warning; a margin becomes wider
+# from one on. From 2.5 to 4.
+_DOUBT = 3.0
 # Seeds of these motions, which are no user's: those of a search, and those of its warnings.
 _SEARCH, _WARN = (0x76A3, 0), (0x76A3, 1)
 
@@ -48,14 +59,11 @@ def _counted(plan: Solution, seed: tuple[int, ...]) -> list[_Counted]:
         VarpinError: Fewer than half of the motions get to the end.
     """
     problem, motion = plan.problem, plan.trajectory
-    bounds, paths = with_margins(problem), _ALONE if problem.scene.noise.diffusion is None else _MOTIONS
+    bounds, paths = with_margins(problem), _MOTIONS // 4 if problem.scene.noise.diffusion is None else _MOTIONS
     keep = max(_ENOUGH, *(math.ceil(paths * ndtr(-bound.source.margin)) for bound in bounds))
     every = Paths.of(problem, plan.policy, children(np.random.default_rng(seed), paths), paths, keep)
-    if every.shared is None:
-        found = joined([simulated(one) for one in every.chunks()], keep)
-    else:
-        with executing(None, None) as pool:
-            found = joined(list(in_order(pool, simulated, every.chunks())), keep)
+    with executing(None, None) as pool:
+        found = joined(list(found_by(every, pool)), keep)
     finished = int(np.isfinite(found.costs).sum())
     if 2 * finished < paths:
         raise VarpinError(f"{paths - finished} of {paths} motions under noise fail")
@@ -64,7 +72,7 @@ def _counted(plan: Solution, seed: tuple[int, ...]) -> list[_Counted]:
         promised = float(ndtr(-bound.source.margin))
         error = math.sqrt(promised * (1.0 - promised) / finished)
         # Where too few motions are beyond, a quantile of more of them, as far as a normal distribution has it to.
-        often = max(round(finished * (promised - _CLEARLY * error)), _ENOUGH)
+        often = max(round(finished * (promised - error)), _ENOUGH)
         planned = bound.value(motion.q, motion.v, problem.control_rows(motion))
         distance = np.partition(largest, len(largest) - often, axis=0)[len(largest) - often] - planned
         needed = distance * max(1.0, bound.source.margin / -float(ndtri(often / finished)))
@@ -87,7 +95,7 @@ def widened(plan: Solution) -> list[Floats] | None:
         return None
     # The same noise in every count: what is left of a violation is then that of the plan, not of other noise.
     counted = {id(row.bound): row for row in _counted(plan, _SEARCH)}
-    if all((row.share <= row.promised + _CLEARLY * row.error).all() for row in counted.values()):
+    if all((row.share <= row.promised + row.error).all() for row in counted.values()):
         return None
     bounds = problem.bound_constraints
     added = [np.zeros(bound.shape) for bound in bounds] if known.added is None else split(bounds, known.added)
@@ -120,3 +128,93 @@ def too_small(solution: Solution) -> list[Finding]:
         )
         found.append(Finding("small margin", sentence, time=time, value=share))
     return found
+
+
+class Tightening:
+    """The margins of a search's rows.
+
+    Attributes:
+        margins: Of each constraint at its places and rows, in its unit.
+        added: What counted motions have added to those at nodes; None without.
+        counts: How often motions have been counted.
+        since: The first iteration from which on rows and margins stay.
+        rounds: How often margins have followed the motion of a search that ended, since then.
+    """
+
+    def __init__(self, problem: OptimalControlProblem) -> None:
+        self.problem = problem
+        self.bound: tuple[BoundConstraint, ...] = ()
+        self.between: Instants = NOWHERE
+        self.margins: list[Floats] = []
+        self.added: list[Floats] | None = None
+        self.counts = self.since = self.rounds = 0
+
+    @property
+    def needed(self) -> bool:
+        """Whether rows have margins that noise widens."""
+        return bool(self.problem.scene.processes) and any(item.source.margin > 0.0 for item in self.bound)
+
+    @property
+    def countable(self) -> bool:
+        """Whether motions may be counted again."""
+        return self.needed and self.counts < _COUNTS
+
+    def enforce(self, bound: tuple[BoundConstraint, ...], between: Instants) -> None:
+        """Begin without margins on constraints, the last of which are at instants between nodes."""
+        self.bound, self.between = bound, between
+        self.margins = [np.zeros(item.shape) for item in bound]
+
+    def renew(self, iteration: int) -> None:
+        """Let margins follow the motion from an iteration on, as rows are new."""
+        self.since, self.rounds = iteration + (_FOLLOWING if self.needed else 0), 0
+
+    def follow(self, along: Steps, plan: Plan, iteration: int, *, grow: bool) -> None:
+        """Move margins towards those of a motion while the search begins; they grow only where rows can be met."""
+        if iteration < self.since:
+            self._move([move for move, _ in self._moves(along, plan, grow=grow)])
+
+    def settle(self, along: Steps, plan: Plan, iteration: int, *, grow: bool) -> bool:
+        """Whether the margins of a motion are others than those that it was found with; they then follow it.
+
+        In between they stay: a merit whose rows move with the motion has no minimum.
+        """
+        if not self.needed or self.rounds >= _ROUNDS:
+            return False
+        moves = self._moves(along, plan, grow=grow)
+        if all((np.abs(move) <= SLIGHT * own.max(axis=0)).all() for move, own in moves):
+            return False
+        if iteration >= self.since:
+            self.since, self.rounds = iteration, self.rounds + 1
+        self._move([move for move, _ in moves])
+        return True
+
+    def widen(self, plan: Solution) -> bool:
+        """Whether margins become wider, as motions under noise violate bounds more often than these promise."""
+        self.counts += 1
+        more = None
+        with contextlib.suppress(VarpinError):
+            more = widened(plan)
+        self.added = self.added if more is None else more
+        return more is not None
+
+    def _move(self, moves: list[Floats]) -> None:
+        self.margins = [used + move for used, move in zip(self.margins, moves, strict=True)]
+
+    def _moves(self, along: Steps, plan: Plan, *, grow: bool) -> list[tuple[Floats, Floats]]:
+        """The moves of all margins towards those of a motion, and these.
+
+        The latter are standard deviations under the plan's feedback, and what is added. Margins grow by a tenth of
+        themselves at most: a motion that meets wide ones at once is violent, and has wider ones. After each round the
+        moves are a smaller part of the way: a motion far from its rows has small margins, which let it come near again.
+        """
+        share, most = 1.0 / (1.0 + self.rounds), TENTH if grow else 0.0
+        kept = [item for item in self.bound if item.source.margin > 0.0]
+        spreads = iter(deviations(along, Feedback(plan.feedback, plan.previous), kept))
+        more = [np.zeros(1)] * len(self.bound)
+        if self.added is not None:
+            more = [*self.added, *(self.added[i][self.between.of(i)[0]] for i in self.between.constraints)]
+        found = []
+        for item, used, extra in zip(self.bound, self.margins, more, strict=True):
+            own = extra + (item.source.margin * next(spreads) if item.source.margin > 0.0 else np.zeros(item.shape))
+            found.append((np.minimum(share * (own - used), most * own), own))
+        return found

@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import copy
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
+from functools import reduce
 
 import numpy as np
 from scipy.special import ndtr
@@ -213,13 +214,21 @@ def path_of(paths: Paths) -> Trajectory:
     return paths.problem.simulate(paths.policy, rng=child)
 
 
+def found_by(paths: Paths, pool: Executor, *, serial: bool = True) -> Generator[Found, None, None]:
+    """What each chunk of paths shows, in their order; ``serial`` where only Python evaluates the noise."""
+    if paths.shared is None and serial:
+        # Custom functions need not be thread-safe.
+        return (simulated(one) for one in paths.chunks())
+    return in_order(pool, simulated, paths.chunks())
+
+
 def joined(parts: Sequence[Found], keep: int) -> Found:
-    """What all paths have shown; the parts' extremes are left out."""
+    """What all paths have shown."""
     counts = tuple(np.sum(own, axis=0) for own in zip(*(part.counts for part in parts), strict=True))
     largest = zip(*(part.largest for part in parts), strict=True)
     return Found(
         costs=np.concatenate([part.costs for part in parts]),
-        extremes={},
+        extremes=reduce(greater, (part.extremes for part in parts)),
         counts=counts,
         largest=tuple(_largest(np.concatenate(own), keep) for own in largest),
     )
@@ -252,56 +261,45 @@ def monte_carlo(
     """See :meth:`Solution.monte_carlo`; for any policy. ``within`` is what no path shows of the noise within steps."""
     paths = count("paths", paths, least=2)
     told_motion("progress", progress, "paths done, paths in all")
-    every = Paths.of(problem, policy, children(rng, paths), paths)
-    parts: list[Found] = []
-    extremes: Extremes = {}
-    done = 0
+    every, parts = Paths.of(problem, policy, children(rng, paths), paths), list[Found]()
 
-    def add(part: Found) -> None:
-        nonlocal extremes, done
-        parts.append(part)
-        extremes = greater(extremes, part.extremes)
-        done += len(part.costs)
-
-    def warned(found: Sequence[Finding]) -> MonteCarlo | None:
-        result = _mean(parts, predicted, within, problem)
-        return None if result is None else replace(result, warnings=(*_lost(result), *found))
+    def tell() -> None:
+        if progress is not None:
+            progress(sum(len(part.costs) for part in parts), paths)
 
     with executing(executor, workers) as pool:
-        q0, v0 = (np.broadcast_to(x, (paths, x.size)) for x in (problem.q0, problem.v0))
-        # Custom functions need not be thread-safe.
-        serial = every.shared is None and executor is None
-        results = (simulated(one) for one in every.chunks()) if serial else in_order(pool, simulated, every.chunks())
-        found: tuple[Finding, ...] = ()
+        result = None
         try:
-            with contextlib.closing(results):
-                take_all(results, add, lambda: progress(done, paths) if progress is not None else None)
-            if every.shared is not None:
-                found = findings_of_paths(every.shared, q0, v0, extremes, pool)
-            elif np.isfinite(parts[0].costs).all():
-                found = _look_alone(every)
+            with contextlib.closing(found_by(every, pool, serial=executor is None)) as results:
+                take_all(results, parts.append, tell)
+            result = _mean(parts, predicted, within, problem)
+            result = None if result is None else _with_findings(result, every, parts, pool)
         except KeyboardInterrupt:
+            result = _mean(parts, predicted, within, problem)
             # A second Ctrl-C skips the check.
             with contextlib.suppress(KeyboardInterrupt):
-                if every.shared is not None and done > 1:
-                    found = findings_of_paths(every.shared, q0[:done], v0[:done], extremes, None)
-                elif done > 1 and np.isfinite(parts[0].costs).all():
-                    found = _look_alone(every)
-            raise MonteCarloInterrupted(warned(found)) from None
-    result = warned(found)
+                result = None if result is None else _with_findings(result, every, parts, None)
+            raise MonteCarloInterrupted(result) from None
     if result is None:
         raise VarpinError(f"fewer than two of {paths} paths got to the end; a smaller dt may help")
     announce(logger, problem.scene.announced, problem.dt, result.warnings)
     return result
 
 
-def _look_alone(paths: Paths) -> tuple[Finding, ...]:
-    """Findings about the first path, whose noise Python evaluates."""
-    motion, scene, policy = path_of(paths), paths.problem.scene, paths.policy
-    # The loop's check is for held controls.
-    loop = () if paths.problem.linear else unstable_loop(scene, motion, policy.hold_at(paths.problem.dt))
-    found = (*loop, *check(scene, paths.problem.integrator, motion, policy).warnings)
-    return tuple(finding.about("path 0: ") for finding in found)
+def _with_findings(result: MonteCarlo, every: Paths, parts: Sequence[Found], pool: Executor | None) -> MonteCarlo:
+    """The result of some paths with findings about them."""
+    found: tuple[Finding, ...] = ()
+    if every.shared is not None:
+        q0, v0 = (np.tile(x, (every.last, 1)) for x in (every.problem.q0, every.problem.v0))
+        found = findings_of_paths(every.shared, q0, v0, joined(parts, 0).extremes, pool)
+    elif np.isfinite(parts[0].costs).all():
+        # The first path, whose noise Python evaluates.
+        motion, scene, policy = path_of(every), every.problem.scene, every.policy
+        # The loop's check is for held controls.
+        loop = () if every.problem.linear else unstable_loop(scene, motion, policy.hold_at(every.problem.dt))
+        own = (*loop, *check(scene, every.problem.integrator, motion, policy).warnings)
+        found = tuple(finding.about("path 0: ") for finding in own)
+    return replace(result, warnings=(*_lost(result), *found))
 
 
 def _lost(result: MonteCarlo) -> tuple[Finding, ...]:
@@ -314,12 +312,10 @@ def _lost(result: MonteCarlo) -> tuple[Finding, ...]:
 
 def _mean(parts: Sequence[Found], predicted: float, within: float, problem: OptimalControlProblem) -> MonteCarlo | None:
     """The result of the paths so far; None if fewer than two are finished."""
-    if not parts:
+    if sum(int(np.isfinite(part.costs).sum()) for part in parts) < 2:
         return None
     found = joined(parts, 0)
     good = found.costs[np.isfinite(found.costs)]
-    if len(good) < 2:
-        return None
     broken = []
     for bound, counts in zip(with_margins(problem), found.counts, strict=True):
         place, row = np.unravel_index(int(counts.argmax()), counts.shape)

@@ -16,10 +16,11 @@ from varpin.control.between_nodes import enforced, middles
 from varpin.control.constraints import BoundRate
 from varpin.control.costs import CostError
 from varpin.control.history import Status
-from varpin.control.multipliers import REPORTED, ConstraintReport, Multipliers, at_nodes, flat
+from varpin.control.multipliers import ConstraintReport, Multipliers, at_nodes, flat
 from varpin.control.problem import require_problem
 from varpin.control.rollout import first_commands
 from varpin.control.search import Search
+from varpin.control.sizes import NOTABLE, TENTH
 from varpin.control.solving import searched
 from varpin.errors import ControlError, InputError, LinearizationError
 from varpin.finding import Finding, announce
@@ -43,10 +44,8 @@ from varpin.trajectory import Nodes, Trajectory
 
 logger = logging.getLogger(__name__)
 
-# Share of late ticks without a warning: other programs on the machine cause a few.
+# Share of late ticks without a warning: other programs on the machine cause a few; from 0.02 to 0.2.
 _FEW = 0.05
-# Violation, in tenths of a constraint's range, that one or two iterations of a tick may leave; from 0.1 to 0.3.
-_MISSED = 0.1
 
 
 @dataclass(frozen=True)
@@ -472,7 +471,7 @@ class _Loop:
                 continue
             c = bound.value(motion.q, motion.v, motion.u)
             reports.append(ConstraintReport(label, bound.rows, bound.unit, bound.times, c, np.zeros_like(c), False))
-            if (worst := reports[-1].violation) > REPORTED * bound.scale:
+            if (worst := reports[-1].violation) > NOTABLE * bound.scale:
                 text = (
                     f"the plant's motion violates {label} by {worst:.2g} {bound.unit}, {reports[-1].where}. Use a "
                     "narrower bound, margin= against noise, a smaller dt or more iterations"
@@ -484,7 +483,7 @@ class _Loop:
 def _violated(plan: Solution) -> list[bool]:
     """Whether a plan violates each of its constraints by more than what few iterations may leave."""
     bounds = plan.problem.bound_constraints
-    return [told.violation > _MISSED * bound.scale for told, bound in zip(plan.constraints, bounds, strict=True)]
+    return [told.violation > TENTH * bound.scale for told, bound in zip(plan.constraints, bounds, strict=True)]
 
 
 def _require_fit(plant: Scene, planned: Scene) -> None:

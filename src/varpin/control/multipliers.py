@@ -13,14 +13,10 @@ from varpin.arrays import Floats
 from varpin.control.between_nodes import Instants, enforced
 from varpin.control.constraints import BoundConstraint
 from varpin.control.problem import OptimalControlProblem
+from varpin.control.sizes import FEASIBLE
 from varpin.io.archive import Axes
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
-
-# Greatest violation of a constraint at its places in a feasible plan, in its own unit.
-FEASIBLE = 1e-6
-# Greatest violation between its places, or by a controller, without a warning, relative to a tenth of its range.
-REPORTED = 1e-2
 
 
 @dataclass(frozen=True, eq=False)

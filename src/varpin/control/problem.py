@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint, BoundRate, Horizon, PlanConstraint
@@ -27,17 +26,18 @@ from varpin.control.costs import (
     control_rate,
     with_control_before,
 )
+from varpin.control.sizes import HARMLESS, ROUNDING
 from varpin.errors import InputError, UnknownName
 from varpin.finding import announce
-from varpin.integrators import Gauss, Integrator, Radau
+from varpin.integrators import Integrator
 from varpin.integrators.registry import require_motion
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene, closest_controls, require_scene, same, tangent_basis
 from varpin.signals.commands import as_moved, cubics
 from varpin.signals.policy import LinearPolicy, OpenLoop
-from varpin.simulation.choice import usual_integrator, usual_kick
+from varpin.simulation.choice import integrator_for
 from varpin.simulation.simulate import simulate
-from varpin.simulation.spectrum import rate_at_rest
+from varpin.simulation.spectrum import natural_rate
 from varpin.simulation.start import on_constraints, time_steps
 from varpin.support.checks import (
     JointValues,
@@ -59,14 +59,8 @@ logger = logging.getLogger(__name__)
 Sampling = Literal["midpoint", "gauss", "start"]
 Shape = Literal["held", "linear"]
 
-# Greatest rate of dampers and dry friction, times the step, for a method that is not L-stable.
-STIFF = 10.0
-# Stages of the default integrator. Two match the cost's order; four resolve friction up to ten times as fast as the
-# step, for a third more time.
-STAGES = 4
-# Greatest natural frequency of the feedback of first motions, times the period of controls; from 0.1 to 0.5. Singular
-# values of the constraints that are rounding errors, relative to the largest; from 1e-12 to 1e-6.
-FASTEST, _SINGULAR = 0.25, 1e-9
+# Greatest natural frequency of the feedback of first motions, times the period of controls; from 0.1 to 0.5.
+FASTEST = 0.25
 # Arguments of a problem that another state, time or control before the horizon may change.
 _MOVED = {"q0", "v0", "t0"}
 # All that another problem may have in place of its own.
@@ -405,7 +399,7 @@ class OptimalControlProblem(Frozen):
         if difference := self.differs(setting):
             return f"of another problem: {difference}"
         found = self.cost_of(trajectory)
-        close = math.isclose(found, cost, rel_tol=1e-9)
+        close = math.isclose(found, cost, rel_tol=HARMLESS)
         return "" if close else f"of a problem with another cost: {cost:.9g}, and here {found:.9g}"
 
     def constraints_on(
@@ -432,18 +426,12 @@ class OptimalControlProblem(Frozen):
         return f"{constraint.label} (constraints[{index[0]}])" if len(alike) > 1 and index else constraint.label
 
     @property
-    def processes(self) -> int:
-        """The number of Wiener processes that plans take into account."""
-        return self.scene.processes
-
-    @property
-    def steered(self) -> NDArray[np.bool_]:
-        """Which increments (K,) can change plans; noise of constant strength adds the same cost to all motions."""
-        found = np.ones(self.scene.increments(linear=self.linear), dtype=np.bool_)
+    def steered(self) -> bool:
+        """Whether controls can change what noise costs; that of constant strength adds the same to all motions."""
         fields = self.scene.noise.diffusion
-        if fields is not None and self.integrator.variational:
-            found[: self.scene.processes] = fields.control.any(axis=(0, 2)) | fields.quadratic.any(axis=0)
-        return found
+        if fields is None or not self.integrator.variational:
+            return self.scene.processes > 0
+        return bool(fields.control.any() or fields.quadratic.any())
 
     @cached_property
     def limited(self) -> bool:
@@ -461,10 +449,17 @@ class OptimalControlProblem(Frozen):
         The feedback is M(q0) (omega^2 (q0 - q) - 2 omega v), twice as fast as the fastest natural motion at q0. Without
         feedback rounding errors alone make an upright arm fall over.
         """
+        scene, q, u = self.scene, self.q0, self.holding_controls()
         R = self.steps if self.linear else self.decisions
-        u, reference = self.holding_controls(), np.append(self.q0, np.zeros(self.q0.size))
+        driven = tangent_basis(scene, q).T @ scene.actuation
+        omega = 2.0 * natural_rate(scene, q, u) + 1.0 / self.duration
+        gains = np.zeros((scene.controls, 2 * q.size))
+        # None where controls are held too long.
+        if np.linalg.matrix_rank(driven) == len(driven) and omega * self.period <= FASTEST:
+            gains = self.feedback(omega)
+        reference = np.append(q, np.zeros(q.size))
         on: Literal["momentum", "velocity"] = "momentum" if self.integrator.variational else "velocity"
-        rows = np.tile(u, (R, 1)), np.tile(self._holding_feedback(), (R, 1, 1)), np.tile(reference, (R, 1))
+        rows = np.tile(u, (R, 1)), np.tile(gains, (R, 1, 1)), np.tile(reference, (R, 1))
         return self.policy_of(*rows, on, before=u if self.linear else None)
 
     def policy_of(
@@ -495,23 +490,6 @@ class OptimalControlProblem(Frozen):
         gains: Floats = -np.linalg.pinv(along.T @ scene.actuation) @ wanted
         gains[scene.prescribed] = 0.0
         return gains
-
-    def _holding_feedback(self) -> Floats:
-        """Gains (m, 2n) of :meth:`holding_policy`; zero where joints are not driven or controls are held too long."""
-        scene, q = self.scene, self.q0
-        jet, along = lagrangian_jet(scene, q, np.zeros(q.size)), tangent_basis(scene, q)
-        curvature, driven = jet.Lqq, along.T @ scene.actuation
-        if scene.constraints:
-            # Constraint forces change with q, too.
-            (C,) = scene.core.constraints(q[None])[2]
-            left = scene.actuation @ self.holding_controls() - scene.static_pull(q)
-            y = np.linalg.lstsq(C.T, left, rcond=_SINGULAR)[0]
-            curvature = curvature - scene.core.constraint_curvature(q, y, np.zeros(q.size))[0]
-        squares = np.linalg.eigvals(np.linalg.solve(along.T @ jet.Lvv @ along, along.T @ curvature @ along))
-        omega = 2.0 * float(np.sqrt(np.abs(squares).max(initial=0.0))) + 1.0 / self.duration
-        if np.linalg.matrix_rank(driven) < len(driven) or omega * self.period > FASTEST:
-            return np.zeros((scene.controls, 2 * q.size))
-        return self.feedback(omega)
 
     def decided(self, trajectory: Trajectory) -> Floats:
         """The controls (R, m) of a motion on the problem's grid, one row per decision."""
@@ -546,11 +524,8 @@ class OptimalControlProblem(Frozen):
 
     def costs(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """The cost (...) of motions without noise terms: q and v (..., N + 1, n), u (..., N, m)."""
-        values = self.running.value(*self.samples(q, v, u))
-        # All samples of a rule have the same weight.
-        running = values.sum(axis=-1) * (self.dt * self.rule[0, 0])
-        total: Floats = running + self.terminal.value(*self._end(q, v))[..., 0]
-        return total if self.rate is None else total + self.rate.value(u[..., :: self.hold, :], self.period)
+        total: Floats = self._shares(q, v, u).sum(axis=-1)
+        return total
 
     def cost_of(self, trajectory: Trajectory) -> float:
         """The cost of one motion on the problem's grid.
@@ -564,7 +539,7 @@ class OptimalControlProblem(Frozen):
             raise InputError(
                 "the problem's controls are linear, the motion's are not: take plan.policy.without_feedback()"
             )
-        if trajectory.steps != self.steps or abs(trajectory.dt - self.dt) > 1e-12 * self.dt:
+        if trajectory.steps != self.steps or abs(trajectory.dt - self.dt) > ROUNDING * self.dt:
             grids = (f"{grid.steps} steps of {grid.dt:g} s" for grid in (trajectory, self))
             raise InputError(f"the motion has {next(grids)}; the problem {next(grids)}")
         return float(self.shares(trajectory).sum())
@@ -575,13 +550,16 @@ class OptimalControlProblem(Frozen):
         The difference of two costs is summed from differences of shares, so a constant in the cost, however large,
         causes no rounding error.
         """
-        q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
+        return self._shares(trajectory.q, trajectory.v, self.control_rows(trajectory))
+
+    def _shares(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        # All samples of a rule have the same weight.
         weight = self.dt * self.rule[0, 0]
-        found = [weight * part.ravel() for part in self.running.shares(*self.samples(q, v, u))]
-        found += [part.ravel() for part in self.terminal.shares(*self._end(q, v))]
+        found = [weight * part for part in self.running.shares(*self.samples(q, v, u))]
+        found += self.terminal.shares(*self._end(q, v))
         if self.rate is not None:
-            found.append(self.rate.shares(u[:: self.hold], self.period))
-        return np.concatenate(found)
+            found.append(self.rate.shares(u[..., :: self.hold, :], self.period))
+        return np.concatenate([part.reshape(*q.shape[:-2], -1) for part in found], axis=-1)
 
     def not_finite(self, trajectory: Trajectory) -> tuple[Cost, ...]:
         """The cost terms that are not finite on a motion; those of the controls' rate are not tested."""
@@ -635,22 +613,6 @@ def require_problem(problem: object) -> OptimalControlProblem:
     if not isinstance(problem, OptimalControlProblem):
         raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
     return problem
-
-
-def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
-    """The integrator of a problem that gives none: Gauss's, with three stages in calm steps, or the L-stable one.
-
-    A mode z times as fast as the step decays by the factor 1 - 40 / z in a step of Gauss(4), and rings after each jump
-    of a held control. Radau's methods do not support constraints of the scene. Noise is held over the step: in the long
-    steps of plans an impulse costs two to five times as much.
-    """
-    kick = usual_kick(scene)
-    if not scene.constraints and dt * rate_at_rest(scene, q0) > STIFF:
-        return Radau(STAGES, kick=kick)
-    if scene.constraints or scene.custom is not None:
-        return Gauss(STAGES, kick=kick)
-    usual = usual_integrator(scene, q0, np.zeros_like(q0), dt, noisy=False)
-    return Gauss(3 if usual == Gauss(2, kick=kick) else STAGES, kick=kick)
 
 
 def _rule(sampling: str, dt: float, *, cubic: bool) -> tuple[Floats, Floats]:

@@ -13,18 +13,15 @@ import piqp
 import scipy.sparse as sp
 
 from varpin.arrays import Floats, Integers
+from varpin.control.constraints.base import LENGTH
 from varpin.control.riccati import Plan
+from varpin.control.sizes import FEASIBLE, HARMLESS, ROUNDING
 from varpin.control.stages import Rows, Stages
 
-# Residuals at which the solver stops, absolute for a cost of gradient one and relative, and those of a solution that it
-# cannot improve further, as weights are far apart.
-_ABSOLUTE, _RELATIVE, _ROUNDED = 1e-10, 1e-11, 1e-7
-# Change of controls, in their own units, that is rounding: a first motion may cost nothing but for it.
-LEAST = 1e-12
+# Residuals at which the solver stops, absolute for a cost of gradient one, and relative; from 1e-12 to 1e-10.
+_RESIDUAL = 1e-11
 # Greatest number of interior-point steps; solved programs take 10 to 40.
 _STEPS = 60
-# Weight of the squares of slacks, relative to their linear cost: it makes them unique.
-_UNIQUE = 1e-9
 
 
 class Minimum(NamedTuple):
@@ -70,7 +67,7 @@ class Program:
         gradient = -(pull @ plan.feedforward[:, :, None])[:, :, 0]
         # The scale of the cost, to which the solver's residuals are relative.
         slope, bend = float(np.abs(gradient).max()), float(np.abs(hessian).max())
-        self._scale = (slope if slope > LEAST * bend else bend) or 1.0
+        self._scale = (slope if slope > ROUNDING * bend else bend) or 1.0
         self._gradient = np.zeros(layout.size)
         np.add.at(self._gradient, at[at >= 0], gradient[at >= 0] / self._scale)
         self._lower, self._upper = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
@@ -123,7 +120,7 @@ class Program:
             parts[kind].append((first[kind] + i, at, slopes))
             for sign in () if weight is None else (1.0, -1.0) if equality else (-1.0,):
                 parts[kind].append((first[kind] + i, size + i, np.full(i.shape, sign)))
-                slacks.append((size + i, size + i, np.full(i.shape, _UNIQUE)))
+                slacks.append((size + i, size + i, np.full(i.shape, HARMLESS)))
                 places.append(at.max(axis=1))
                 size += len(i)
             first[kind] += len(i)
@@ -169,11 +166,11 @@ class _Form:
                 solver = self._solvers[kind] = piqp.SparseSolver()
                 settings = solver.settings
                 settings.kkt_solver = kind
-                settings.eps_abs, settings.eps_rel, settings.max_iter = _ABSOLUTE, _RELATIVE, _STEPS
+                settings.eps_abs, settings.eps_rel, settings.max_iter = _RESIDUAL, _RESIDUAL, _STEPS
                 solver.setup(P, c, A, b, G, None, most, lower, upper)
             status, known = solver.solve(), solver.result.info
-            rounded = status == piqp.PIQP_MAX_ITER_REACHED and max(known.primal_res, known.dual_res) <= _ROUNDED
-            if status == piqp.PIQP_SOLVED or rounded:
+            rounded = max(known.primal_res, known.dual_res) <= LENGTH * FEASIBLE
+            if status == piqp.PIQP_SOLVED or (status == piqp.PIQP_MAX_ITER_REACHED and rounded):
                 return solver.result
             if status == piqp.PIQP_PRIMAL_INFEASIBLE:
                 return None

@@ -15,16 +15,12 @@ import numpy as np
 from varpin import core
 from varpin.arrays import Floats, Mask
 from varpin.control.problem import OptimalControlProblem
+from varpin.control.sizes import HARMLESS, ROUNDING
 from varpin.control.stages import Layout, Recursion, Steps
 from varpin.integrators.base import noise_fields
 from varpin.linearization import velocity_at_nodes, velocity_curvature
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
-
-# Greatest relative rounding error of Quu; above, the pass is repeated on square roots.
-TRUSTED = 1e-9
-# Size of eigenvalues that are rounding errors in a Hessian with unit diagonal.
-_ROUNDING = 1e-12
 
 
 class Plan(NamedTuple):
@@ -69,7 +65,7 @@ def backward(
     """
     expanded = steps.recursion(curvature, fixed)
     plain = _pass(steps, expanded, regularization, second=curvature is not None, roots=False)
-    if curvature is not None or (plain is not None and plain.loss <= TRUSTED):
+    if curvature is not None or (plain is not None and plain.loss <= HARMLESS):
         return plain
     return _pass(steps, expanded, regularization, second=False, roots=True) or plain
 
@@ -138,7 +134,7 @@ def noise_shares(problem: OptimalControlProblem, motion: Trajectory, plan: Plan)
 
     Empty where there is no noise.
     """
-    if problem.processes == 0:
+    if problem.scene.processes == 0:
         return np.zeros(0)
     scene, n, left = problem.scene, problem.scene.robot.dof, problem.integrator.left
     q, v = motion.q, motion.v
@@ -185,9 +181,9 @@ def squares_of(gradient: Floats, hessian: Floats) -> Squares | None:
     size = np.sqrt(np.abs(np.diagonal(hessian, axis1=-2, axis2=-1)))
     unit = np.where(size > 0.0, size, 1.0)
     values, vectors = np.linalg.eigh(hessian / (unit[..., :, None] * unit[..., None, :]))
-    if not (values >= -_ROUNDING).all():
+    if not (values >= -ROUNDING).all():
         return None
-    weight, known = np.sqrt(np.maximum(values, 0.0)), values > _ROUNDING
+    weight, known = np.sqrt(np.maximum(values, 0.0)), values > ROUNDING
     across = np.swapaxes(vectors, -1, -2)
     along = (across @ (gradient / unit)[..., None])[..., 0]
     shift = np.where(known, along / np.where(known, weight, 1.0), 0.0)

@@ -105,15 +105,12 @@ def beyond_samples(
 
 def _damping(problem: OptimalControlProblem, motion: Trajectory) -> tuple[Floats, Floats]:
     """The damping (N, n, n) where steps begin and where they end: friction that falls with velocity is left out."""
-    scene = problem.scene
-    forces = motion.u @ scene.actuation.T
+    scene, forces = problem.scene, motion.u @ problem.scene.actuation.T
     begin, end = (
-        damping_matrices(scene, motion.q[part], motion.v[part], forces) for part in (slice(None, -1), slice(1, None))
+        damping_matrices(scene, motion.q[part], motion.v[part], forces, custom=True)
+        for part in (slice(None, -1), slice(1, None))
     )
-    if scene.custom is None:
-        return begin, end
-    own = np.array([-scene.custom(q, v, True)[2] for q, v in zip(motion.q, motion.v, strict=True)])
-    return begin + own[:-1], end + own[1:]
+    return begin, end
 
 
 def _left_at_end(problem: OptimalControlProblem, Z: Floats, P: Floats) -> Floats:

@@ -22,16 +22,16 @@ from varpin.control.between_nodes import NOWHERE, Instants, enforced, followed
 from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.history import Iteration, SearchState, Status
-from varpin.control.line_search import Taken, Trial, line_search
-from varpin.control.multipliers import FEASIBLE, Multipliers, flat, split
+from varpin.control.line_search import HALF, QUARTER, Taken, Trial, line_search
+from varpin.control.margins import Tightening
+from varpin.control.multipliers import Multipliers, flat, split
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.qp import LEAST, Minimum, Program, changes
+from varpin.control.qp import Minimum, Program, changes
 from varpin.control.riccati import Plan, backward, foreseen, noise_shares
 from varpin.control.rollout import around
-from varpin.control.second_order import curvature_along
+from varpin.control.sizes import FEASIBLE, HARMLESS, NOTABLE, ROUNDING, SLIGHT, TENTH, TRACE
 from varpin.control.solution import Solution
 from varpin.control.stages import Layout, Rows, Stages, Steps, states
-from varpin.control.tightening import Tightening
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError, StepError
 from varpin.integrators import Integrator
@@ -48,30 +48,14 @@ logger = logging.getLogger(__name__)
 
 # Errors that reject a trial, or end a search that has made a step.
 TRIAL_ERRORS = (CostError, NoiseFieldError, CustomForceError, StepError, LinearizationError)
-# The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu: it falls after
-# long steps and rises after none, or after two short ones in a row.
-_GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e16
-_LONG, _SHORT = 0.25, 0.1
-# Iterations that together gain no more than the tolerance, or hardly lower violations, before a search ends.
-_PATIENCE = 10
-# Share of the violations that a search has to remove, at its end or in that many iterations; from 1e-3 to 1e-1.
-_REMOVED = 1e-2
-# Share of the first motion's cost at stake that counts beside that of the present one.
-_NOTHING = 1e-9
+# Iterations that together gain no more than the tolerance, or hardly lower violations, before a search ends; halvings
+# of a step before a refinement ends. From 6 to 20.
+PATIENCE = 10
 # Weight of the rows in the merit: this many times the largest multiplier, and at most _HEAVY times, as heavy rows
 # shorten steps; where rows cannot all be met, this many times what the cost is per violation. From 3 to 100.
 _ABOVE, _HEAVY = 1.5, 10.0
-# Slack of rows that are met, and of rows that a step approaches, relative to the violations; the latter from 0.5 on.
-_MET, _APPROACHED = 1e-6, 0.9
-# Decrease, as a share of the cost at stake, from which on motions are looked at between nodes; from 1e-4 to 1e-2.
-_CLOSE = 1e-3
 # Greatest number of halvings of a trial's steps beyond those that the present motion needs; from 2 to 6.
 _HALVINGS = 4
-# Multipliers that are no more than that, relative to the largest, distances from a limit, relative to it, and falls of
-# violations, relative to them, are none: interior points end inside their bounds.
-_TRACE = 1e-6
-# Relative rounding error of Quu above which the gains are reported as unreliable.
-_LOSSY = 1e-8
 
 
 class Step(NamedTuple):
@@ -180,7 +164,7 @@ class Search:
                 logger.warning("%s: %s", self.label, error)
                 self.reason = str(error)
                 return Status.NOT_DIFFERENTIABLE
-            close = ended is None and self._known.decrease <= _CLOSE * stake.moved
+            close = ended is None and self._known.decrease <= SLIGHT * stake.moved
             if (close or ended in (Status.CONVERGED, Status.INFEASIBLE)) and self._goes_on(ended):
                 continue
             ended = ended or self._out_of(last, deadline)
@@ -208,7 +192,7 @@ class Search:
             if not self._regularize():
                 self._calm()
                 dear = self.weight * self._badness
-                if self.violation > FEASIBLE and step.elastic and step.decrease <= _REMOVED * dear:
+                if self.violation > FEASIBLE and step.elastic and step.decrease <= NOTABLE * dear:
                     return self._infeasible()
                 self.reason = f"no step lowers the cost, whatever the regularization; {self._numbers(tolerance)}"
                 return Status.STALLED
@@ -273,7 +257,7 @@ class Search:
         if self.regularization > 0.0 and not self.second_order and self._is_saturated():
             self.second_order = True
             logger.info("%s: servos are at the limits of their drives: second derivatives from now on", self.label)
-        curvature = curvature_along(along, self._costates()) if self.second_order else None
+        curvature = along.curvature(self._costates()) if self.second_order else None
         # Within limits and rows the regularization is a cost of the quadratic program, whose model stays exact.
         plan = self._pass(0.0 if self.bound else self.regularization, curvature) or self._pass(
             self.regularization, curvature
@@ -285,7 +269,7 @@ class Search:
             return False
         self.plan = self.noise = plan
         self.exact = curvature is not None
-        if problem.processes and self.regularization > 0.0:
+        if problem.scene.processes and self.regularization > 0.0:
             # Noise grows under regularized gains.
             self.noise = self._pass(0.0) or plan
         if self._has_goals:
@@ -296,7 +280,7 @@ class Search:
         plain = self.regularization == 0.0 and not self._has_goals
         free = not self.bound and (not problem.limited or self._is_free(plan, ()))
         if not free:
-            self.stages = Stages.along(along, self.noise.spread if problem.processes else None, curvature)
+            self.stages = Stages.along(along, self.noise.spread if problem.scene.processes else None, curvature)
             given = zip(self.bound, self.tightening.margins, strict=True)
             self.rows = [self.stages.rows(*pair) for pair in given]
             self._excess = [_excess(row.values, equality=row.equality) for row in self.rows]
@@ -341,20 +325,20 @@ class Search:
         needed = np.inf if found is None else _ABOVE * _largest(found.multipliers)
         # Rows that cost far more than what is at stake are approached step by step.
         stake = max(abs(self.cost), self.first)
-        dear = max(self.weight, _HEAVY * (stake if stake > LEAST**2 * program.stiffness else program.stiffness))
+        dear = max(self.weight, _HEAVY * (stake if stake > ROUNDING**2 * program.stiffness else program.stiffness))
         elastic = bool(rows) and needed > dear
         if elastic:
             missed = program.minimum(values, weight=dear)
-            elastic = missed is not None and (found is None or missed.slack <= _APPROACHED * bad)
+            elastic = missed is not None and (found is None or missed.slack <= (1.0 - NOTABLE) * bad)
             found, self.weight = (missed, dear) if elastic else (found, self.weight)
         self.unsolved = found is None
         if found is None:
             return False
         largest = _largest(found.multipliers)
-        if not elastic or found.slack <= _MET * max(bad, 1.0):
+        if not elastic or found.slack <= TRACE * max(bad, 1.0):
             self.weight = max(min(self.weight, _HEAVY * largest), _ABOVE * largest)
         self.multipliers = [
-            (np.where(np.abs(part) > _TRACE * largest, part, 0.0) / item.scale).reshape(item.shape)
+            (np.where(np.abs(part) > TRACE * largest, part, 0.0) / item.scale).reshape(item.shape)
             for part, item in zip(found.multipliers, self.bound, strict=True)
         ]
         linear, whole = stages.change(found.z)
@@ -403,7 +387,7 @@ class Search:
 
     def _ended(self, tolerance: float) -> Status | None:
         """The status of a search whose step gains no more than the tolerance; None if it goes on."""
-        least = not self.problem.steered.any() and self.along.stake.free <= tolerance * _NOTHING * self.first
+        least = not self.problem.steered and self.along.stake.free <= tolerance * HARMLESS * self.first
         if least and self.violation <= FEASIBLE:
             # The cost is at its lower bound. Without costs of the controls the model may have no minimum even there.
             return Status.CONVERGED
@@ -425,16 +409,16 @@ class Search:
         if self.violation > FEASIBLE:
             # By the program, or by what the search has done.
             dear, merits = self.weight * bad, self._merits()
-            left = step.minimum is not None and step.elastic and step.minimum.slack >= (1.0 - _TRACE) * bad
-            if left and step.decrease <= max(share, _TRACE * dear):
+            left = step.minimum is not None and step.elastic and step.minimum.slack >= (1.0 - TRACE) * bad
+            if left and step.decrease <= max(share, TRACE * dear):
                 return Status.INFEASIBLE
-            stays = len(merits) > _PATIENCE and merits[-_PATIENCE - 1] - min(merits[-_PATIENCE:]) <= _REMOVED * dear
+            stays = len(merits) > PATIENCE and merits[-PATIENCE - 1] - min(merits[-PATIENCE:]) <= NOTABLE * dear
             return Status.INFEASIBLE if stays else None
         if step.decrease <= share:
             return Status.CONVERGED
-        gained = sum(item.decrease for item in self.history[-_PATIENCE:])
-        if len(self.history) > _PATIENCE and gained <= share:
-            self.reason = f"{_PATIENCE} iterations have lowered the merit by {gained:.1e}; {self._numbers(tolerance)}"
+        gained = sum(item.decrease for item in self.history[-PATIENCE:])
+        if len(self.history) > PATIENCE and gained <= share:
+            self.reason = f"{PATIENCE} iterations have lowered the merit by {gained:.1e}; {self._numbers(tolerance)}"
             return Status.STALLED
         return None
 
@@ -456,7 +440,7 @@ class Search:
                 if not self._made():
                     self.regularization = kept
                     self._made()
-        if problem.processes and problem.limited and not (self.tightening.needed or self._has_goals or self.tick):
+        if problem.scene.processes and problem.limited and not (self.tightening.needed or self._has_goals or self.tick):
             # Controls at their limits do not react to noise, and the plan tells what it costs then.
             u, (lower, upper) = problem.decided(self.trajectory), problem.control_limits
             held = self._pass(0.0, fixed=(u <= lower) | (u >= upper))
@@ -502,7 +486,7 @@ class Search:
                     return Trial()
                 terms = problem.shares(moved)
                 merit = float((terms - self.shares).sum())
-                if problem.processes:
+                if problem.scene.processes:
                     merit += float((noise_shares(problem, moved, noise) - shares).sum())
                 if self.bound:
                     merit += self.weight * (sum(float(part.sum()) for part in self._violations(moved)) - bad)
@@ -539,7 +523,7 @@ class Search:
         if z is not None and problem.limited:
             aim = now + length * Layout.of(problem).controls_of(z)
             for limit, sign in zip(problem.control_limits, (-1.0, 1.0), strict=True):
-                there = np.isfinite(limit) & (sign * (aim - limit) >= -_TRACE * np.abs(limit))
+                there = np.isfinite(limit) & (sign * (aim - limit) >= -TRACE * np.abs(limit))
                 u, gains = np.where(there, limit, u), np.where(there[:, :, None], 0.0, gains)
                 previous = None if previous is None else np.where(there[:, :, None], 0.0, previous)
         x = states(problem, self.trajectory)[: -1 : problem.hold]
@@ -575,7 +559,7 @@ class Search:
 
     def _share(self, tolerance: float) -> float:
         """Tolerance on the expected decrease, in units of the cost."""
-        return tolerance * (self.along.stake.moved + _NOTHING * self.first)
+        return tolerance * (self.along.stake.moved + HARMLESS * self.first)
 
     def _expected(self) -> str:
         return f"the expected decrease is {self._known.decrease:.1e}"
@@ -623,21 +607,24 @@ class Search:
         report(item, self.trajectory)
 
     def _regularize(self) -> bool:
-        """Adapt the regularization to the last step; False if no more of it helps."""
+        """Adapt the regularization to the last step; False if no more of it helps (Tassa, Erez and Todorov 2012).
+
+        It falls after long steps, and rises after none or two short ones in a row.
+        """
         lengths = [item.step for item in self.history[-2:]]
-        if lengths[-1] >= _LONG:
-            self.growth = min(1.0 / _GROWTH, self.growth / _GROWTH)
+        if lengths[-1] >= QUARTER:
+            self.growth = min(HALF, HALF * self.growth)
             self.regularization *= self.growth
-            if self.regularization < _LEAST:
+            if self.regularization < TRACE:
                 self.regularization = 0.0
-        elif lengths[-1] == 0.0 or (max(lengths) <= _SHORT and len(lengths) > 1):
+        elif lengths[-1] == 0.0 or (max(lengths) <= TENTH and len(lengths) > 1):
             return self._stiffen()
         return True
 
     def _stiffen(self) -> bool:
-        self.growth = max(_GROWTH, self.growth * _GROWTH)
-        self.regularization = max(_LEAST, self.regularization * self.growth)
-        return self.regularization <= _MOST
+        self.growth = max(1.0 / HALF, self.growth / HALF)
+        self.regularization = max(TRACE, self.regularization * self.growth)
+        return self.regularization <= 1.0 / ROUNDING
 
     def solution(self, status: Status) -> Solution:
         """The motion, however the search ended, with the feedback around it."""
@@ -655,7 +642,7 @@ class Search:
                 added=None if self.tightening.added is None else flat(self.tightening.added),
             )
         reason = self.reason
-        if plan is not None and plan.loss > _LOSSY:
+        if plan is not None and plan.loss > HARMLESS:
             lost = f"rounding may have changed Quu by {plan.loss:.0e} of itself: weights or inertias are too far apart"
             logger.warning("%s: the gains cannot be trusted: %s", self.label, lost)
             reason = f"{reason}; {lost}"

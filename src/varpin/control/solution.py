@@ -1,11 +1,12 @@
-"""The result of a solver, with its feedback policy, verification and Monte Carlo simulation."""
+"""The result of a solver: its policy, verification, Monte Carlo simulation, and files, which leave the problem out."""
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,23 +14,28 @@ from typing import Annotated, Literal
 import numpy as np
 
 from varpin.arrays import Floats
+from varpin.control.between_nodes import enforced
 from varpin.control.history import Iteration, Refinement, SearchState, Status
 from varpin.control.monte_carlo import MonteCarlo, monte_carlo
 from varpin.control.multipliers import ConstraintReport, Multipliers, reports
 from varpin.control.noise import left_within_steps
 from varpin.control.problem import OptimalControlProblem, require_problem
-from varpin.control.solution_file import read, write
 from varpin.control.stages import Feedback, Steps
 from varpin.control.verification import Verification, verify
-from varpin.errors import InputError
+from varpin.errors import FileError, InputError
 from varpin.finding import Finding
-from varpin.io.archive import Axes
+from varpin.io.archive import Axes, members_of, read_npz, record_of, write_npz
 from varpin.linearization import velocity_at_nodes
+from varpin.model import Robot
 from varpin.signals.policy import LinearPolicy
-from varpin.support.checks import JointValues, count, flag, positive, word
+from varpin.support.checks import JointValues, count, flag, path_like, positive, word
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, folded, listed, table, warning_count
 from varpin.trajectory import Trajectory
+
+logger = logging.getLogger(__name__)
+
+_FORMAT = "varpin.solution/5"
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +167,11 @@ class Solution(Frozen):
         Raises:
             FileError: The path cannot be written.
         """
-        return write(path, self)
+        members = members_of(replace(self.trajectory, scene_values={})) | members_of(self)
+        # The numbers of the scene are those of the motion.
+        for name, value in self.problem.setting.items():
+            members[name if name.startswith("scene.") else f"problem.{name}"] = value
+        return write_npz(path, _FORMAT, members)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], problem: OptimalControlProblem) -> Solution:
@@ -171,7 +181,28 @@ class Solution(Frozen):
             FileError: The file is missing, truncated, no npz, written by something else, holds pickled objects, arrays
                 that do not fit together or are not finite, or is of another problem.
         """
-        return read(cls, path, require_problem(problem))
+        source = path_like("path", path)
+        members, scene = read_npz(source, _FORMAT), require_problem(problem).scene
+        # First the motion, whose masses give a clearer message for another robot.
+        motion = replace(Trajectory.of_members(source, members, scene.robot), scene_values=scene.values)
+        known = [name for name in members if name.startswith(("problem.", "scene."))]
+        setting = {name.removeprefix("problem."): np.asarray(members[name]) for name in known}
+        if difference := problem.differs(setting):
+            raise FileError(f"{source} is of another problem: {difference}")
+        sizes = {"decisions": problem.decisions, "controls": scene.controls, "states": 2 * scene.robot.dof}
+        plan = record_of(cls, members, source, sizes=sizes, known={"problem": problem, "trajectory": motion})
+        if other := problem.mismatch(setting, motion, plan.cost):
+            raise FileError(f"{source} is {other}")
+        if bool(problem.constraints) != (plan.multipliers is not None):
+            raise FileError(f"{source}: multipliers of the problem's constraints do not belong to it, or are missing")
+        if plan.multipliers is not None:
+            _require_rows(source, plan.multipliers, problem)
+        if (problem.rate is not None or problem.linear) and plan.previous_gains is None:
+            raise FileError(f"{source}: previous_gains is missing")
+        made = len(plan.history)
+        if plan.search is not None and not 0 <= plan.search.iterations <= made:
+            raise FileError(f"{source}: search.iterations is {plan.search.iterations}, where 0 to {made} belongs")
+        return plan
 
     def shifted(
         self, decisions: int, before: JointValues | None = None, x: Literal["momentum", "velocity"] | None = None
@@ -262,15 +293,10 @@ class Solution(Frozen):
         """
         positive("tolerance", tolerance, "1")
         count("max_substeps", max_substeps, least=2)
-        return verify(
-            self.problem,
-            self.trajectory,
-            self.cost,
-            self.policy_on,
-            tolerance=tolerance,
-            max_substeps=max_substeps,
-            progress=progress,
-        )
+        found = verify(self, tolerance=tolerance, max_substeps=max_substeps, progress=progress)
+        if not found.told:
+            logger.warning("%s", found.reading)
+        return found
 
     def monte_carlo(
         self,
@@ -318,3 +344,27 @@ class Solution(Frozen):
             executor=executor,
             progress=progress,
         )
+
+
+def solution_trajectory(path: str | os.PathLike[str], robot: Robot | None = None) -> Trajectory:
+    """Read only the motion of a solution, without its problem.
+
+    Raises:
+        FileError: As :meth:`Trajectory.load`.
+    """
+    source = path_like("path", path)
+    return Trajectory.of_members(source, read_npz(source, _FORMAT), robot)
+
+
+def _require_rows(source: Path, multipliers: Multipliers, problem: OptimalControlProblem) -> None:
+    """Refuse multipliers of another number of rows, or of instants that the problem does not have."""
+    between = multipliers.between
+    last = len(problem.constraints), problem.steps
+    if not ((between.rows >= 0) & (between.rows < last)).all():
+        raise FileError(f"{source}: multipliers.between.rows are not in the problem's steps")
+    every = sum(item.size for item in enforced(problem, between).bound_constraints)
+    at_nodes = sum(item.size for item in problem.bound_constraints)
+    for name, expected in (("values", every), ("backoff", every), ("added", at_nodes)):
+        found = getattr(multipliers, name)
+        if found is not None and found.size != expected:
+            raise FileError(f"{source}: multipliers.{name} has shape ({found.size},), where ({expected},) belongs")

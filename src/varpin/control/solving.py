@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike
 from varpin import core
 from varpin.arrays import Floats
 from varpin.control.checks import foreseen, looked_at
-from varpin.control.history import ITERATIONS, Iteration, Status
-from varpin.control.multipliers import FEASIBLE
+from varpin.control.history import Iteration, Status
 from varpin.control.problem import FASTEST, OptimalControlProblem, require_problem
-from varpin.control.refine import SUFFICIENT, refine
+from varpin.control.refine import refine
 from varpin.control.rollout import around, controls_along, first_commands
 from varpin.control.search import Report, Search
+from varpin.control.sizes import FEASIBLE, NOTABLE, TRACE
 from varpin.control.solution import Solution
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, VarpinError
@@ -46,7 +46,7 @@ def solve(
     controls: JointValues | LinearPolicy | Solution | None = None,
     *,
     tolerance: float = 1e-7,
-    max_iterations: int = ITERATIONS,
+    max_iterations: int = 500,
     second_order: bool = False,
     regularization: float = 0.0,
     time_limit: float = np.inf,
@@ -181,7 +181,7 @@ def solve(
 
             def once(finer: OptimalControlProblem, start: Trajectory | None) -> Solution:
                 given, on = (controls, path) if start is None else (finer.decided(start), (start.q, start.v))
-                return plan_of(finer, given, None, on, max(tolerance, SUFFICIENT * wish))
+                return plan_of(finer, given, None, on, max(tolerance, NOTABLE * wish))
 
             solution = refine(problem, once, wish, lambda: deadline - time.perf_counter())
     return looked_at(solution) if check else solution
@@ -213,7 +213,7 @@ def _path_of(problem: OptimalControlProblem, given: Any) -> _Path:
     if isinstance(given, Trajectory):
         if given.joint_names != names:
             raise InputError(f"states: the motion is of joints {given.joint_names}, the problem of {names}")
-        if given.steps == problem.steps and not np.isclose(given.dt, problem.dt, rtol=1e-6):
+        if given.steps == problem.steps and not np.isclose(given.dt, problem.dt, rtol=TRACE):
             raise InputError(
                 f"states: the motion has dt = {given.dt:g} s, the problem {problem.dt:g} s: give its q alone"
             )

@@ -19,7 +19,13 @@ from varpin.control.constraints import BoundConstraint, BoundRate
 from varpin.control.costs import CostError, Expansion
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.samples import after_impulse, at_samples, beyond_samples
-from varpin.linearization import Linearization, linearize_steps, velocity_at_nodes
+from varpin.linearization import (
+    Linearization,
+    linearize_steps,
+    second_order_steps,
+    velocity_at_nodes,
+    velocity_curvature,
+)
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
 
@@ -30,14 +36,6 @@ _ROUNDED = 16.0 * float(np.finfo(np.float64).eps)
 def states(problem: OptimalControlProblem, motion: Trajectory) -> Floats:
     """X (N + 1, 2n): (q, p) or (q, v)."""
     return np.concatenate((motion.q, motion.p if problem.integrator.variational else motion.v), axis=1)
-
-
-def in_step(lin: Linearization) -> tuple[Floats, Floats]:
-    """Derivatives (N, 2n, Z) of linearized steps in their variables, and those of the noise's effect (N, 2n, k, Z)."""
-    if lin.ramp is None or lin.Gramp is None:
-        return np.concatenate([lin.A, lin.B], axis=2), np.concatenate([lin.Gx, lin.Gu], axis=3)
-    J = np.concatenate([lin.A, lin.B - lin.ramp, lin.ramp], axis=2)
-    return J, np.concatenate([lin.Gx, lin.Gu - lin.Gramp, lin.Gramp], axis=3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,18 +124,18 @@ class Steps:
         return linearize_steps(problem.scene, self.trajectory, problem.integrator, problem.q0, ramps=problem.linear)
 
     @cached_property
-    def _in_step(self) -> tuple[Floats, Floats]:
-        return in_step(self.lin)
-
-    @property
     def J(self) -> Floats:
         """Derivatives of the state after each step in its variables (N, 2n, Z)."""
-        return self._in_step[0]
+        lin = self.lin
+        own = (lin.B,) if lin.ramp is None else (lin.B - lin.ramp, lin.ramp)
+        return np.concatenate([lin.A, *own], axis=2)
 
-    @property
+    @cached_property
     def Gz(self) -> Floats:
         """Derivatives of the noise's effect in the variables (N, 2n, k, Z)."""
-        return self._in_step[1]
+        lin = self.lin
+        own = (lin.Gu,) if lin.Gramp is None else (lin.Gu - lin.Gramp, lin.Gramp)
+        return np.concatenate([lin.Gx, *own], axis=3)
 
     @cached_property
     def _velocity(self) -> Floats:
@@ -228,6 +226,35 @@ class Steps:
         gradient = (np.swapaxes(weighted, 1, 2) @ self.lin.G.reshape(N, x * k, 1))[:, :, 0]
         return gradient, np.swapaxes(self.Gz.reshape(N, x * k, Z), 1, 2) @ weighted
 
+    def curvature(self, costate: Floats) -> Floats:
+        """Second derivatives of the steps (N, Z, Z) in the cost to go, whose slopes are ``costate`` (N, 2n) after each.
+
+        Of linear controls they are those in their mean over the step, exact for one stage; the rest is of higher order.
+        """
+        problem, motion = self.problem, self.trajectory
+        scene, n, rule, N = problem.scene, problem.scene.robot.dof, problem.rule, problem.steps
+        gradient = self.running.gradient.reshape(N, len(rule), -1)
+        # The running cost's gradient in v0, q1 and v1 of each step.
+        v0, q1, v1 = (
+            problem.dt * rule[0, 0] * (rule[:, 1 + c] @ gradient[:, :, :n] + rule[:, 5 + c] @ gradient[:, :, n : 2 * n])
+            for c in (1, 2, 3)
+        )
+        z = costate.copy()
+        z[:, :n] += q1
+        z += np.einsum("Ni,Nix->Nx", v1, self.slopes[1:, n:])
+        second = second_order_steps(scene, motion, z, problem.integrator)
+        ux, uu = second.ux, second.uu
+        if problem.linear:
+            late = np.full(scene.controls, 0.5)
+            late[scene.prescribed] = 1.0  # inputs are where they lead to
+            ends = np.vstack([np.diag(1.0 - late), np.diag(late)])
+            ux, uu = ends @ ux, ends @ uu @ ends.T
+        total = np.block([[second.xx, np.swapaxes(ux, 1, 2)], [ux, uu]])
+        total[:, : 2 * n, : 2 * n] += velocity_curvature(scene, motion.q[:-1], motion.v[:-1], v0)
+        after = velocity_curvature(scene, motion.q[1:], motion.v[1:], v1)
+        found: Floats = total + np.swapaxes(self.J, 1, 2) @ after @ self.J
+        return found
+
     def closed(self, feedback: Feedback, *, halves: bool = False) -> Floats:
         """Matrices (N, Z, Z) to the variables of each step, from the state before it and the controls of the last one.
 
@@ -275,13 +302,10 @@ class Steps:
         gradient[first:, kept], hessian[first:, kept[:, None], kept] = narrow.gradient, narrow.hessian
         if problem.rate is not None:
             pull, rate = (part / problem.dt for part in self.rate)
-            decided, later = slice(None, None, problem.hold), slice(first, None, problem.hold)
-            gradient[decided, u] += pull
-            hessian[decided, u, u] += rate
-            gradient[later, w] -= pull[first:]
-            hessian[later, w, w] += rate[first:]
-            hessian[later, w, u] -= rate[first:]
-            hessian[later, u, w] -= rate[first:]
+            decided = slice(None, None, problem.hold)
+            change = np.eye(m, X + m, X) - np.eye(m, X + m, x)
+            gradient[decided] += pull @ change
+            hessian[decided] += change.T @ rate @ change
         found, begin = Recursion(J, gradient, hessian, G, Gz), problem.begin
         if begin is None:
             return found

@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
-from varpin.control.problem import STIFF, OptimalControlProblem
+from varpin.control.problem import OptimalControlProblem
+from varpin.control.sizes import NOTABLE
 from varpin.core.arrays import Commands
 from varpin.integrators import Gauss, Integrator, Radau, RungeKutta4
 from varpin.signals.commands import open_line, open_loop
-from varpin.signals.policy import LinearPolicy
+from varpin.simulation.choice import STIFF
 from varpin.simulation.record import rollout
 from varpin.simulation.spectrum import rate_at_rest
 from varpin.support.markup import facts, table
 from varpin.trajectory import Trajectory
 
-logger = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    from varpin.control.solution import Solution
 
-# A plan's policy on (q, p) or (q, v), in parts of its steps.
-Policy: TypeAlias = Callable[[Literal["momentum", "velocity"], int], LinearPolicy]
-
-# Relative difference of costs from which on it counts: above it nothing can be concluded from an inaccurate one.
-CLEAR = 0.01
 # Integrators of the continuous system: without and with fast damping, and with constraints of the scene.
 _USUAL, _FAST, _CLOSED = RungeKutta4(), Radau(3), Gauss(stages=3)
 _READING = (
@@ -67,7 +63,7 @@ class ViolationOnRobot:
             NaN where the motion diverges.
         closed_loop: The same with feedback.
         where: The worst row and time with feedback, in words; empty without violation or where the motion diverges.
-        range: The range of the constraint's values, in the same unit; 1 m or 3 rad for frames and clearance.
+        range: The range of the constraint's values, in the same unit; 1 m or rad for frames and clearance.
     """
 
     label: str
@@ -109,7 +105,6 @@ class Verification:
             the plan's step.
         constraints: Violations of the problem's constraints on the continuous system, without margins, at the nodes of
             the accurate integration from the plan's first one on. Rate limits of controls apply to decisions.
-        decided: Whether the substeps ended because the cost with feedback is surely greater than was asked for.
     """
 
     planned_cost: float
@@ -121,7 +116,6 @@ class Verification:
     accuracy: float
     integrator: str = str(_USUAL)
     constraints: tuple[ViolationOnRobot, ...] = ()
-    decided: bool = False
 
     @property
     def violation(self) -> float:
@@ -134,7 +128,7 @@ class Verification:
     @property
     def told(self) -> bool:
         """Whether the costs are known to a percent; if not, nothing can be concluded about the plan."""
-        return self.accuracy <= CLEAR or self.decided or self._diverges
+        return self.accuracy <= NOTABLE or self._diverges
 
     @property
     def open_loop_loss(self) -> float:
@@ -151,7 +145,7 @@ class Verification:
         return not np.isfinite([self.open_loop_cost, self.closed_loop_cost]).any()
 
     @property
-    def _reading(self) -> str:
+    def reading(self) -> str:
         """How to read the costs, or why they say nothing."""
         if self.told:
             return _READING
@@ -177,7 +171,7 @@ class Verification:
         if np.isfinite(self.accuracy):
             good = f"costs are good to {self.accuracy:.0e} of themselves"
         how = f"{good} ({self.substeps} substeps a step, {self.integrator})"
-        return [how, self._reading, *map(str, self.constraints)]
+        return [how, self.reading, *map(str, self.constraints)]
 
     def _repr_html_(self) -> str:
         head, *rows = self._rows()
@@ -204,23 +198,20 @@ def percent(part: float) -> str:
 
 
 def verify(
-    problem: OptimalControlProblem,
-    plan: Trajectory,
-    planned_cost: float,
-    policy: Policy,
+    plan: Solution,
     *,
     tolerance: float,
-    max_substeps: int = 1024,
-    progress: Callable[[int, int], None] | None = None,
-    above: float = np.inf,
+    max_substeps: int,
     substeps: int = 2,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Verification:
-    """Compare a plan, and its policy on (q, p) or (q, v), with accurate integrations.
+    """Compare a plan with accurate integrations.
 
-    The parts of steps, ``substeps`` at first, double until the relative change of both costs is at most ``tolerance``,
-    or the cost with feedback is surely greater than ``above``. Where the explicit method does not reach that because of
-    fast dampers or dry friction, the L-stable one repeats the comparison.
+    The parts of steps, ``substeps`` at first, double until the relative change of both costs is at most ``tolerance``.
+    Where the explicit method does not reach that because of fast dampers or dry friction, the L-stable one repeats the
+    comparison.
     """
+    problem, end = plan.problem, plan.trajectory.q[-1]
     stiff = problem.dt * rate_at_rest(problem.scene, problem.q0) > STIFF
     members = (_FAST,) if stiff else (_USUAL, _FAST)
     for integrator in (_CLOSED,) if problem.scene.constraints else members:
@@ -228,40 +219,35 @@ def verify(
         while True:
             if progress is not None:
                 progress(parts, max_substeps)
-            opened, closed = replays(problem, problem.decided(plan), policy, integrator, parts)
+            opened, closed = replays(plan, integrator, parts)
             changes = [
                 abs(now.cost - then) / max(abs(now.cost), np.finfo(float).tiny)
                 for now, then in zip((opened, closed), before, strict=True)
                 if np.isfinite(now.cost) and np.isfinite(then)
             ]
-            decided = bool(closed.cost - above > abs(closed.cost - before[1]))
             before, accuracy = (opened.cost, closed.cost), max(changes, default=np.inf)
-            if decided or accuracy <= tolerance or 2 * parts > max_substeps:
+            if accuracy <= tolerance or 2 * parts > max_substeps:
                 break
             parts *= 2
         found = Verification(
-            planned_cost=planned_cost,
+            planned_cost=plan.cost,
             open_loop_cost=opened.cost,
             closed_loop_cost=closed.cost,
-            open_loop_gap=float(np.abs(opened.nodes[-1] - plan.q[-1]).max()),
-            closed_loop_gap=float(np.abs(closed.nodes[-1] - plan.q[-1]).max()),
+            open_loop_gap=float(np.abs(opened.nodes[-1] - end).max()),
+            closed_loop_gap=float(np.abs(closed.nodes[-1] - end).max()),
             substeps=parts,
             accuracy=accuracy,
             integrator=str(integrator),
-            constraints=_violations(problem, plan, opened, closed),
-            decided=decided,
+            constraints=_violations(plan, opened, closed),
         )
         if found.told or not problem.scene.dissipates:
             break
-    if not found.told and above == np.inf:
-        logger.warning("%s", found._reading)
     return found
 
 
-def _violations(
-    problem: OptimalControlProblem, plan: Trajectory, opened: Played, closed: Played
-) -> tuple[ViolationOnRobot, ...]:
-    both = zip(_outside(problem, problem, plan), opened.outside, closed.outside, strict=True)
+def _violations(plan: Solution, opened: Played, closed: Played) -> tuple[ViolationOnRobot, ...]:
+    problem = plan.problem
+    both = zip(_outside(problem, problem, plan.trajectory), opened.outside, closed.outside, strict=True)
     return tuple(
         ViolationOnRobot(
             problem.label_of(bound.source), bound.unit, own.worst, alone.worst, fed.worst, str(fed), 10.0 * bound.scale
@@ -270,16 +256,14 @@ def _violations(
     )
 
 
-def replays(
-    problem: OptimalControlProblem, controls: Floats, policy: Policy, integrator: Integrator, parts: int
-) -> tuple[Played, Played]:
+def replays(plan: Solution, integrator: Integrator, parts: int) -> tuple[Played, Played]:
     """A plan in parts of its steps, without noise: under its controls alone, and with feedback at its own rate.
 
     Raises:
         VarpinError: A custom cost or noise field fails off the plan.
     """
-    fine = problem.in_parts(parts)
-    opened, closed = in_parts(problem, controls, policy, integrator, parts)
+    problem, fine = plan.problem, plan.problem.in_parts(parts)
+    opened, closed = in_parts(plan, integrator, parts)
     return played(problem, fine, opened, integrator), played(problem, fine, closed, integrator)
 
 
@@ -318,13 +302,11 @@ def at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats |
     return c
 
 
-def in_parts(
-    problem: OptimalControlProblem, controls: Floats, policy: Policy, integrator: Integrator, parts: int
-) -> tuple[Commands, Commands]:
-    """Commands in parts of a plan's steps: the controls (R, m) alone, and with feedback."""
-    variational, times = integrator.variational, integrator.stage_times
-    alone = open_line(controls, times) if problem.linear else open_loop(controls)
+def in_parts(plan: Solution, integrator: Integrator, parts: int) -> tuple[Commands, Commands]:
+    """Commands in parts of a plan's steps: its controls alone, and with feedback."""
+    problem, variational, times = plan.problem, integrator.variational, integrator.stage_times
+    alone = open_line(plan.controls, times) if problem.linear else open_loop(plan.controls)
     m, n = problem.scene.controls, problem.scene.robot.dof
-    fed = policy("momentum" if variational else "velocity", parts)
+    fed = plan.policy_on("momentum" if variational else "velocity", parts)
     closed = fed.commands(problem.steps * parts, m, n, variational=variational, stage_times=times)
     return alone._replace(hold=problem.hold * parts), closed

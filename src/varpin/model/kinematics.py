@@ -99,6 +99,28 @@ def mass_carriers(robot: Robot) -> Links:
     return links(robot.tree)
 
 
+def reach(robot: Robot, frame: FrameKinematics) -> float:
+    """Upper bound on a frame's distance from its first joint [m]; infinite on free rails.
+
+    It is the shortest chain of hops from joint to joint, or over one revolute joint to the next but one.
+    """
+    links = frame.links.tree
+    hops = [*links.translation[1:], frame.translation]
+    lower, upper = robot.position_limits
+    ends = np.array([lower, upper])[:, links.coordinate]
+    slides = np.where(links.prismatic, np.abs(links.ratio * ends + links.offset).max(axis=0), 0.0)
+    most = [0.0]
+    for k, hop in enumerate(hops):
+        ways = [most[k] + slides[k] + np.linalg.norm(hop)]
+        if k > 0 and not links.prismatic[k]:
+            # Turned about joint k, the hop leads farthest away where it points away from its axis as the one before.
+            before = links.rotation[k].T @ hops[k - 1]
+            across = np.hypot(*before[:2]) + np.hypot(*hop[:2])
+            ways.append(most[k - 1] + slides[k - 1] + np.hypot(across, before[2] + hop[2]))
+        most.append(float(min(ways)))
+    return most[-1]
+
+
 def require_same(name: str, made_for: Robot, robot: Robot | None) -> None:
     """Raise an InputError for something, ``name``, that was made for another robot than a problem's."""
     if robot is not None and not made_for.built_like(robot):

@@ -13,7 +13,7 @@ from varpin.errors import InputError
 from varpin.integrators import Gauss, Integrator, Midpoint, Radau
 from varpin.mechanics.scene import Scene
 from varpin.signals.policy import LinearPolicy
-from varpin.simulation.spectrum import fastest_damping, pulls_fast, stops_ahead
+from varpin.simulation.spectrum import fastest_damping, pulls_fast, rate_at_rest, stops_ahead
 
 # The default, and the default under noise, where more stages do not raise the strong order.
 _USUAL, _NOISY = Gauss(2), Midpoint(kick="held")
@@ -22,6 +22,11 @@ _SWINGING, _TURNS = Gauss(4), 0.4
 # The integrator where damping is this many times faster than the step: there velocities of other methods lag and ring,
 # and with three stages the response to jumping torques is wrong by a tenth.
 _STOPPING, _RINGS = Radau(4), 2.0
+# Greatest rate of dampers and dry friction, times the step, for a method that is not L-stable; from 5 to 20.
+STIFF = 10.0
+# Stages of the default integrator. Two match the cost's order; four resolve friction up to ten times as fast as the
+# step, for a third more time.
+STAGES = 4
 # Most joints of a robot for which rates are computed: for more it takes as long as a motion.
 _MOST_JOINTS = 200
 
@@ -36,7 +41,7 @@ def given_integrator(integrator: object, controls: object = None) -> Integrator 
 
 
 def usual_integrator(scene: Scene, q0: Floats, v0: Floats, dt: float, *, noisy: bool) -> Integrator:
-    """The integrator of a motion where none is given; that of a plan is :func:`varpin.control.problem.integrator_for`.
+    """The integrator of a motion where none is given; that of a plan is :func:`integrator_for`.
 
     Under noise it is the midpoint rule with the noise held over the step, whose stationary distributions are those of
     the continuous system also where damping is faster than the step; Radau's velocities lose nearly all of the noise.
@@ -58,6 +63,22 @@ def usual_integrator(scene: Scene, q0: Floats, v0: Floats, dt: float, *, noisy: 
             chosen = _STOPPING
     # A motion without the noise of its scene may be linearized.
     return replace(chosen, kick=usual_kick(scene))
+
+
+def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
+    """The integrator of a problem that gives none: Gauss's, with three stages in calm steps, or the L-stable one.
+
+    A mode z times as fast as the step decays by the factor 1 - 40 / z in a step of Gauss(4), and rings after each jump
+    of a held control. Radau's methods do not support constraints of the scene. Noise is held over the step: in the long
+    steps of plans an impulse costs two to five times as much.
+    """
+    kick = usual_kick(scene)
+    if not scene.constraints and dt * rate_at_rest(scene, q0) > STIFF:
+        return Radau(STAGES, kick=kick)
+    if scene.constraints or scene.custom is not None:
+        return Gauss(STAGES, kick=kick)
+    usual = usual_integrator(scene, q0, np.zeros_like(q0), dt, noisy=False)
+    return Gauss(3 if usual == Gauss(2, kick=kick) else STAGES, kick=kick)
 
 
 def usual_kick(scene: Scene) -> Literal["left", "held"]:

@@ -9,7 +9,7 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.mechanics.forces import dissipates, limited_servos, of_kind
 from varpin.mechanics.lagrangian import lagrangian_jet
-from varpin.mechanics.scene import Scene
+from varpin.mechanics.scene import Scene, tangent_basis
 from varpin.model import longest_reach
 
 # Nodes at which rates along a motion are looked for, beside those where joints are slowest or in their stops.
@@ -21,6 +21,8 @@ _SHORTEST = 1e-8
 # Joints that hardly move are measured by the others: by this share of what those move at the robot's reach, and by this
 # share of the largest speed of their kind.
 _LITTLE, _SLOW = 1e-2, 5e-2
+# Singular values of constraints that are rounding errors, relative to the largest; from 1e-12 to 1e-6.
+_DEPENDENT = 1e-9
 # Rates below count as zero [1/s].
 _SLOWEST = 1e-6
 
@@ -89,6 +91,20 @@ def rate_at_rest(scene: Scene, q: Floats) -> float:
     for servo in limited_servos(scene.elements):
         force[0, servo.coordinate] = servo.values[0] * q[servo.coordinate]
     return fastest_damping(scene, q[None], still, force, _SLOWEST)
+
+
+def natural_rate(scene: Scene, q: Floats, u: Floats) -> float:
+    """The fastest rate [1/s] of swings or growth about a configuration (n,) where controls (m,) hold it."""
+    still = np.zeros_like(q)
+    jet, along = lagrangian_jet(scene, q, still), tangent_basis(scene, q)
+    curvature = jet.Lqq
+    if scene.constraints:
+        # Constraint forces change with q, too.
+        (C,) = scene.core.constraints(q[None])[2]
+        forces = np.linalg.lstsq(C.T, scene.actuation @ u - scene.static_pull(q), rcond=_DEPENDENT)[0]
+        curvature = curvature - scene.core.constraint_curvature(q, forces, still)[0]
+    squares = np.linalg.eigvals(np.linalg.solve(along.T @ jet.Lvv @ along, along.T @ curvature @ along))
+    return math.sqrt(float(np.abs(squares).max(initial=0.0)))
 
 
 def fastest_rate(scene: Scene, q: Floats, v: Floats, u: Floats, least: float) -> float:

@@ -101,13 +101,7 @@ class KeepClear(PlanConstraint):
             name: (begin.tolist(), end.tolist(), radius) for name, (begin, end, radius) in self._of.capsules.items()
         }
 
-    def missing(self, q: Floats, t: float) -> Floats:
-        """Missing distance of each pair (N, pairs) [m] at configurations (N, n) and time t [s]; negative if clear."""
-        found: Floats = self.distance - self._of.over(np.array([t])).distances(q)
-        return found
-
     def bind(self, horizon: Horizon) -> BoundConstraint:
-        """See :meth:`PlanConstraint.bind`."""
         require_same(self.label, self.robot, horizon.robot)
         places, times = horizon.places
         return _BoundClearance(self, places, times, self.pairs, "m", LENGTH, self._of.over(times), self.distance)

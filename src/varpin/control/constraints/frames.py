@@ -18,14 +18,13 @@ from varpin.control.constraints.base import (
     PlanConstraint,
     checked_margin,
 )
+from varpin.control.sizes import SLIGHT
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
 from varpin.model.kinematics import frame_kinematics, require_same
 from varpin.support.checks import finite, finite_array, named_limits, over_time, positive, rotation_matrix
 
 _XYZ = ("x", "y", "z")
-# Scale: a tenth of a large rotation [rad].
-_ANGLE = 0.3
 
 
 class _OfFrame(PlanConstraint):
@@ -39,7 +38,6 @@ class _OfFrame(PlanConstraint):
 
     @property
     def label(self) -> str:
-        """See :attr:`PlanConstraint.label`."""
         return f"{type(self).__name__}({self.frame!r})"
 
 
@@ -62,10 +60,6 @@ class ReachFrame(_OfFrame):
             frame: Name of the frame.
             position: Goal of its origin in the world (3,) [m]; by default free.
             rotation: Goal of its rotation matrix, from the frame's axes to the world's (3, 3); by default free.
-
-        Raises:
-            UnknownFrame: The robot has no such frame.
-            InputError: The frame is fixed to the base, there is no goal, or the goal is no position or no rotation.
         """
         self._take(robot, frame)
         if position is None and rotation is None:
@@ -74,13 +68,11 @@ class ReachFrame(_OfFrame):
         self.rotation = None if rotation is None else rotation_matrix("ReachFrame rotation", rotation)
 
     def bind(self, horizon: Horizon) -> BoundConstraint:
-        """See :meth:`PlanConstraint.bind`."""
         require_same(self.label, self.robot, horizon.robot)
         rows: tuple[str, ...] = () if self.position is None else tuple(f"position {axis}" for axis in _XYZ)
         rows += () if self.rotation is None else tuple(f"rotation {axis}" for axis in _XYZ)
         unit = "m and rad" if len(rows) == 6 else "m" if self.rotation is None else "rad"
-        scale = LENGTH if self.position is not None else _ANGLE
-        return _BoundGoal(self, np.array([horizon.steps]), horizon.t[-1:], rows, unit, scale, self)
+        return _BoundGoal(self, np.array([horizon.steps]), horizon.t[-1:], rows, unit, LENGTH, self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +106,7 @@ def _log_slope(e: Floats) -> Floats:
     """The inverse of SO(3)'s right Jacobian at the rotation vector e (3,): d log(R) over the body's rotation."""
     angle = float(np.linalg.norm(e))
     E = np.array([[0.0, -e[2], e[1]], [e[2], 0.0, -e[0]], [-e[1], e[0], 0.0]])
-    near = angle < 1e-4
+    near = angle < SLIGHT
     part = 1.0 / 12.0 + angle**2 / 720.0 if near else 1.0 / angle**2 - 0.5 / (angle * np.tan(0.5 * angle))
     slope: Floats = np.eye(3) + 0.5 * E + part * E @ E
     return slope
@@ -130,11 +122,6 @@ class _BoundRegion(BoundConstraint):
         _, p = self.region.kinematics.placements(np.ascontiguousarray(at.reshape(-1, at.shape[-1])))
         p = (p.reshape(*at.shape[:-1], 3) - self.shifts).reshape(-1, 3)
         return self.region.distances(p).reshape(*at.shape[:-1], len(self.rows))
-
-    def outside(self, place: Floats) -> Floats:
-        """The values c (rows,) for a position (3,) [m] at the last node."""
-        found: Floats = self.region.distances((place - self.shifts[-1])[None])[0]
-        return found
 
     def jacobian(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
         _, p, J = self.region.kinematics.jacobians(np.ascontiguousarray(q[self.places]))
@@ -154,7 +141,6 @@ class _Region(_OfFrame):
         """Derivatives of the distances in p (N, rows, 3)."""
 
     def bind(self, horizon: Horizon) -> BoundConstraint:
-        """See :meth:`PlanConstraint.bind`."""
         require_same(self.label, self.robot, horizon.robot)
         places, times = horizon.places
         return _BoundRegion(self, places, times, self._rows, "m", LENGTH, self, self.shifts(times))
@@ -175,12 +161,10 @@ class _WithinPlanes(_Region):
     _most: Floats
 
     def distances(self, p: Floats) -> Floats:
-        """See the base."""
         found: Floats = p @ self._outward.T - self._most
         return found
 
     def slopes(self, p: Floats) -> Floats:
-        """See the base."""
         return np.broadcast_to(self._outward, (len(p), *self._outward.shape))
 
 
@@ -199,10 +183,6 @@ class KeepInHalfSpace(_WithinPlanes):
             offset: Least normal . p, with the normal as given; for a unit normal, the distance of the plane from the
                 world's origin along it [m].
             margin: In standard deviations of the distance under noise.
-
-        Raises:
-            UnknownFrame: The robot has no such frame.
-            InputError: The frame is fixed to the base, or the normal has no length.
         """
         self._take(robot, frame)
         given = finite_array("KeepInHalfSpace normal", normal, (3,))
@@ -271,12 +251,10 @@ class _OfSphere(_Region):
         return self.center[None]
 
     def distances(self, p: Floats) -> Floats:
-        """See the base."""
         beyond: Floats = np.linalg.norm(p, axis=1, keepdims=True) - self.radius
         return -beyond if self.outside else beyond
 
     def slopes(self, p: Floats) -> Floats:
-        """See the base."""
         length = np.linalg.norm(p, axis=1, keepdims=True)
         # At the centre, where the distance has no gradient: any direction to leave the sphere, none to stay inside.
         fixed = np.array([0.0, 0.0, 1.0 if self.outside else 0.0])

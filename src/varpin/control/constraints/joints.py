@@ -14,9 +14,6 @@ from varpin.model import Robot, joint_unit, require_robot
 from varpin.model.kinematics import require_same
 from varpin.support.checks import JointValues, as_floats, control_array, control_values, real, some_limits
 
-# Scale of velocities without a finite range [rad/s or m/s].
-_SPEED = 0.5
-
 
 @dataclass(frozen=True, eq=False)
 class _BoundLinear(BoundConstraint):
@@ -46,10 +43,6 @@ class _WithinLimits(PlanConstraint):
             limits: (lower, upper), each one number, (n,) or by joint name, infinite where there is none; by default the
                 robot's [rad or m; of velocities rad/s or m/s].
             margin: In standard deviations of the joint under noise; see the page on plans within constraints.
-
-        Raises:
-            UnknownJoint: An unknown joint name.
-            InputError: There is no limit, or an argument has a wrong shape or value.
         """
         self.robot = require_robot(robot, type(self).__name__)
         name = type(self).__name__
@@ -58,7 +51,6 @@ class _WithinLimits(PlanConstraint):
         self.margin = checked_margin(self, margin)
 
     def bind(self, horizon: Horizon) -> BoundConstraint:
-        """See :meth:`PlanConstraint.bind`."""
         require_same(self.label, self.robot, horizon.robot)
         # Upper limits, then lower ones.
         sides, columns = np.nonzero(np.isfinite(self.limits[::-1]))
@@ -74,7 +66,7 @@ class _WithinLimits(PlanConstraint):
                 f"{names[side]} limit of {self.robot.joint_names[c]}" for side, c in zip(sides, columns, strict=True)
             ),
             joint_unit(self.robot, sorted(set(columns.tolist())), speed=self.in_velocity),
-            0.1 * float(np.median(whole)) if whole.size else (_SPEED if self.in_velocity else LENGTH),
+            0.1 * float(np.median(whole)) if whole.size else LENGTH,
             slopes,
             signs * self.limits[::-1][sides, columns],
         )
@@ -121,7 +113,6 @@ class BoundRate(BoundConstraint):
         return np.flatnonzero(np.isfinite(self.limit))
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
-        """See :meth:`BoundConstraint.value`."""
         u = u[..., :: self.hold, :]
         first = u[..., :1, :] if self.before is None else np.broadcast_to(self.before, (*u.shape[:-2], 1, u.shape[-1]))
         rate = np.diff(u, axis=-2, prepend=first)[..., self.places, :] / self.period
@@ -149,9 +140,6 @@ class WithinControlRate(PlanConstraint):
                 is none, and for joints that are not named [control/s].
             before: The control before the horizon, for the first change: one number, (m,) or by joint name. By default
                 that of a ``ControlRateCost`` in the cost; without one, the first change is free.
-
-        Raises:
-            InputError: A limit that is not positive, or NaN.
         """
         name = "WithinControlRate limit"
         self.limit = dict(limit) if isinstance(limit, Mapping) else as_floats(name, limit)
@@ -161,11 +149,9 @@ class WithinControlRate(PlanConstraint):
         self.before = before
 
     def after(self, before: Floats) -> PlanConstraint:
-        """See :meth:`PlanConstraint.after`."""
         return WithinControlRate(self.limit, before)
 
     def bind(self, horizon: Horizon) -> BoundConstraint:
-        """See :meth:`PlanConstraint.bind`."""
         name, m, joints = "WithinControlRate", horizon.controls, horizon.control_joints
         if isinstance(self.limit, Mapping):
             limit = control_array(f"{name} limit", self.limit, joints, absent=np.inf)

@@ -19,6 +19,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats, Integers
+from varpin.control.sizes import ROUNDING, TRACE
 from varpin.core import CostTerms, Subject
 from varpin.errors import InputError, VarpinError
 from varpin.model import Robot
@@ -29,11 +30,6 @@ from varpin.support.markup import facts
 from varpin.trajectory import Trajectory
 
 ReferenceValues = ArrayLike | Callable[[float], ArrayLike]
-
-# Of a weight's eigenvalues, relative to its largest entry.
-_ROUNDING = 1e-12
-# Share of a step, by which rounding must not put a time at a node into the step before it.
-_OF_STEP = 1e-6
 
 
 class CostError(VarpinError, ValueError):
@@ -118,6 +114,9 @@ class BoundCost(Frozen, ABC):
 class Cost(Frozen, ABC):
     """A cost. A subclass implements ``bind``; ``CustomCost`` takes a function instead.
 
+    Costs raise an InputError for arguments of a wrong shape or value, such as a weight that is indefinite, an
+    UnknownJoint or UnknownFrame for a name that the robot does not have, and a CostError where a function fails.
+
     Attributes:
         factor: What it is scaled by in a sum.
         at_end: Whether it is a terminal cost instead of an integral over time.
@@ -188,11 +187,9 @@ class CostSum(Cost):
 
     @property
     def terms(self) -> tuple[Cost, ...]:
-        """See :attr:`Cost.terms`."""
         return self.parts
 
     def bind(self, points: Points) -> BoundSum:
-        """See :meth:`Cost.bind`."""
         return BoundSum(tuple((term.factor, term.bind(points)) for term in self.parts), points)
 
     def __repr__(self) -> str:
@@ -248,7 +245,6 @@ class BoundTerm(BoundCost):
         return BoundSum(((1.0, self),), self.points)
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
-        """See :meth:`BoundCost.value`."""
         return self._alone.value(q, v, u)
 
     def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
@@ -298,7 +294,6 @@ class BoundSum(BoundCost):
         return [self.compiled(q, v, u), *(factor * part.value(q, v, u) for factor, part in self.others)]
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
-        """See :meth:`BoundCost.value`."""
         compiled, *others = self.shares(q, v, u)
         total: Floats = compiled.sum(axis=-1)
         for values in others:
@@ -306,7 +301,6 @@ class BoundSum(BoundCost):
         return total
 
     def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
-        """See :meth:`BoundCost.expand`."""
         gradient, hessian = self.core.expand(q, v, u)
         for factor, part in self.others:
             expansion = part.expand(q, v, u)
@@ -353,7 +347,7 @@ def checked_weight(name: str, weight: object) -> Floats:
         raise InputError(f"{name} weight must be a number, a vector or a square matrix, got {array.shape}")
     array = 0.5 * (array + array.T) if array.ndim == 2 else array
     least = np.linalg.eigvalsh(array).min(initial=0.0) if array.ndim == 2 else array.min(initial=0.0)
-    if least < -_ROUNDING * np.abs(array).max(initial=0.0):
+    if least < -ROUNDING * np.abs(array).max(initial=0.0):
         raise InputError(f"{name} weight must be positive semidefinite; its least value is {least:g}")
     array.setflags(write=False)
     return array
@@ -398,7 +392,7 @@ def sample(
     if array.shape in ((), shape):
         return np.array(np.broadcast_to(array, (1, *shape)))
     if held and array.shape == (steps, *shape):
-        step = np.floor(points.elapsed * (steps / points.duration) + _OF_STEP).astype(np.int64)
+        step = np.floor(points.elapsed * (steps / points.duration) + TRACE).astype(np.int64)
         held_rows: Floats = array[np.minimum(step, steps - 1)]
         return held_rows
     if array.shape != (N, *shape):

@@ -38,11 +38,9 @@ class _Quadratic(LeastSquares):
 
     @property
     def timed(self) -> bool:
-        """See :attr:`Cost.timed`."""
         return callable(self.reference) or (isinstance(self.reference, np.ndarray) and self.reference.ndim > 1)
 
     def bind(self, points: Points) -> BoundCost:
-        """See :meth:`Cost.bind`."""
         name, of_controls = type(self).__name__, self._block == 2
         size = points.controls if of_controls else points.dof
 
@@ -74,9 +72,6 @@ class TrackingCost(_Quadratic):
                 is linear [rad or m].
             weight: One number, (n,), by joint name, with 0 for joints that are not named, or a matrix (n, n), positive
                 semidefinite.
-
-        Raises:
-            InputError: A weight that is not finite, indefinite, or neither number, vector nor square matrix.
         """
         super().__init__(reference, weight)
 
@@ -132,9 +127,6 @@ class _Barrier(LeastSquares):
                 between the limits of a joint is used.
             limits: (lower, upper), each one number, (n,) or by joint name, infinite where there is none; the robot's if
                 left out [rad or m; of velocities rad/s or m/s].
-
-        Raises:
-            InputError: There is no limit, or an argument has a wrong shape or value.
         """
         name, joints = type(self).__name__, require_robot(robot, type(self).__name__).joint_names
         self.robot = robot
@@ -148,7 +140,6 @@ class _Barrier(LeastSquares):
         self.margin = np.minimum(margin, 0.5 * (self.limits[1] - self.limits[0]))
 
     def bind(self, points: Points) -> BoundCost:
-        """See :meth:`Cost.bind`."""
         name = type(self).__name__
         require_same(name, self.robot, points.robot)
         weight = weight_matrix(name, self.weight, points.dof)

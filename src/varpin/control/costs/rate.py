@@ -42,9 +42,6 @@ class ControlRateCost(LeastSquares):
                 positive semidefinite [cost s / control^2].
             before: The control before the horizon, for the first change: one number, (m,) or by joint name. By default
                 the first control is free.
-
-        Raises:
-            InputError: A weight that is not finite, indefinite, or neither number, vector nor square matrix.
         """
         self.weight = weight if isinstance(weight, Mapping) else checked_weight("ControlRateCost", weight)
         self.before = (

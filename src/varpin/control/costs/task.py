@@ -49,11 +49,9 @@ class _TaskCost(LeastSquares):
 
     @property
     def timed(self) -> bool:
-        """See :attr:`Cost.timed`."""
         return callable(self.target) or np.ndim(self.target) > len(self.shape)
 
     def bind(self, points: Points) -> BoundTerm:
-        """See :meth:`Cost.bind`."""
         name = type(self).__name__
         require_same(name, self.robot, points.robot)
         target = sample(name, self.target, points, self.shape)
@@ -70,10 +68,6 @@ class _FrameCost(_TaskCost):
             target: A constant, a function of the time [s] that returns one, or an array of one for each of the
                 problem's N + 1 nodes. Between nodes it is linear; rotations turn evenly.
             weight: One number, a vector or a matrix, positive semidefinite; zeros leave directions out.
-
-        Raises:
-            UnknownFrame: The robot has no such frame.
-            InputError: The frame is fixed to the base, or a weight is no such weight.
         """
         self._take(robot, target, weight, frame=frame)
 
@@ -97,7 +91,6 @@ class FrameOrientationCost(_FrameCost):
     shape = (3, 3)
 
     def bind(self, points: Points) -> BoundTerm:
-        """See :meth:`Cost.bind`."""
         bound = super().bind(points)
         try:
             _require_rotations(bound.target)
@@ -175,10 +168,6 @@ class ManipulabilityCost(_TaskCost):
             weight: One number.
             directions: Which velocities of the frame are to be possible: ``"all"`` six, ``"linear"``, ``"angular"``, or
                 some of x, y, z, rx, ry, rz, in world axes.
-
-        Raises:
-            UnknownFrame: The robot has no such frame.
-            InputError: More directions than coordinates, of which one is always impossible; or as for the others.
         """
         self.least = positive("ManipulabilityCost least", least, "m or rad for each direction")
         self._take(robot, self.least, weight, frame=frame)
@@ -198,5 +187,4 @@ class ManipulabilityCost(_TaskCost):
         self._rows = np.array([_DIRECTIONS.index(name) for name in chosen], dtype=np.int64)
 
     def bind(self, points: Points) -> BoundTerm:
-        """See :meth:`Cost.bind`."""
         return replace(super().bind(points), directions=self._rows)

@@ -11,13 +11,13 @@ from typing import Any
 from varpin.control import constraints as plan
 from varpin.control import costs
 from varpin.control.costs import Cost
-from varpin.control.problem import STAGES
 from varpin.integrators import BY_NAME, Gauss, Integrator
 from varpin.mechanics import constraints, forces
 from varpin.mechanics.constraints import Constraint, CustomConstraint
 from varpin.mechanics.forces import Force
 from varpin.mechanics.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
 from varpin.model.clearance import Obstacle
+from varpin.simulation.choice import STAGES
 
 
 def _word_of(name: str) -> str:

@@ -13,7 +13,6 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.control import OptimalControlProblem, Solution, solve
 from varpin.control.costs import CostError
-from varpin.control.problem import integrator_for
 from varpin.errors import InputError
 from varpin.integrators import Integrator
 from varpin.io.scenefile import kinds
@@ -26,7 +25,7 @@ from varpin.mechanics.reduction import Required
 from varpin.mechanics.scene import Scene, closest_controls
 from varpin.model import Robot, models_dir
 from varpin.signals.policy import LinearPolicy
-from varpin.simulation.choice import usual_integrator
+from varpin.simulation.choice import integrator_for, usual_integrator
 from varpin.simulation.simulate import simulate
 from varpin.support.checks import count, positive
 from varpin.support.markup import facts
