@@ -189,11 +189,11 @@ def ball(r, at, distance):
         (lambda r, k: ball(r, [2.0, 0.5, 0.4], k * 0.1), "KeepClear: the distance"),
         (
             lambda r, k: vp.KeepOutOfSphere(r, "tool0", k * np.array([0.9, 0.3, 0.4]), 0.1),
-            "KeepOutOfSphere('tool0'): the distance",
+            "KeepOutOfSphere('tool0'): the",
         ),
         (
             lambda r, k: vp.KeepInHalfSpace(r, "tool0", [0.0, 0.0, 1.0], k * -0.3),
-            "KeepInHalfSpace('tool0'): the distance",
+            "KeepInHalfSpace('tool0'): the",
         ),
     ],
 )
