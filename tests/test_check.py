@@ -43,7 +43,6 @@ def agree(motion, q, rel=0.05, least=1e-10):
 
 
 def right():
-    """A motion that the gate lets pass, whose error is not yet computed."""
     motion = moved(FREE, dt=0.005, steps=100)
     assert "error about" in repr(motion)
     assert 0.0 < motion.error_bound < 1e-4
@@ -51,7 +50,6 @@ def right():
 
 
 def test_lazy_error(tmp_path):
-    """It is computed when it is asked for, the same however the motion got there."""
     motion, own = right(), right()
     known = motion.error
     assert f"error {known.max():.2g}" in repr(motion)
@@ -103,6 +101,23 @@ def test_kinematic_inputs():
     np.testing.assert_allclose(motion.q[1:, 0], 0.3 + 0.3 * np.sin(4.0 * t[1:]), atol=1e-14)
     line = vp.OpenLoop(lambda s: [np.interp(s, t, 0.3 + 0.3 * np.sin(4.0 * t))])
     agree(motion, finer(scene, motion, line, start=start))
+
+
+@pytest.mark.parametrize(
+    ("force", "integrator", "dt"),
+    [
+        (vp.CoulombFriction(0.5), RK4, 0.005),
+        (vp.JointStop(1e3, 5.0, -0.8, 0.8), None, 0.02),
+    ],
+)
+def test_forces_sharper_than_the_step(force, integrator, dt):
+    """More stages do not resolve kinks: the repetition must not be off alike."""
+    scene = vp.Scene(vp.load_robot("ur5"), damping=0.2, friction=0, forces=force)
+    for seed in range(4):
+        start = np.full(6, 0.5), np.random.default_rng(seed).uniform(-2.0, 2.0, 6)
+        motion = moved(scene, integrator, dt=dt, steps=50, start=start)
+        true = np.abs(motion.q - finer(scene, motion, parts=64, integrator=vp.Radau(4), start=start)).max()
+        assert 0.8 < motion.error.max() / true < 1.25
 
 
 def test_chaos():
@@ -352,6 +367,13 @@ def test_the_second_part_of_a_split_kick_has_the_field_at_the_end_of_its_step():
     assert motion.error.max() < 1e-9
 
 
+def test_friction_that_turns_in_a_step_is_repeated_on_either_side():
+    scene = vp.Scene(slider(1.0), gravity=False, forces=vp.CoulombFriction(0.01, 0.1))
+    for speed in (1.0, -1.0):
+        motion = vp.simulate(scene, [0.0], [speed], dt=0.05, steps=20, controls=[-2.0 * speed])
+        assert motion.error_bound is None
+
+
 def test_a_joint_that_hardly_turns_is_measured_by_the_others():
     scene = vp.Scene(vp.planar_chain(2), gravity=False, stiffness=[0.0, 1e3])
     assert not vp.simulate(scene, [0.0, 4e-5], [1.0, 0.0], dt=0.02, steps=50, integrator=MIDPOINT).warnings
@@ -369,7 +391,6 @@ def test_a_slide_that_hardly_moves_is_measured_by_the_arm_that_turns():
 
 
 def test_a_ramp_is_the_polynomial_of_two_stages():
-    """Nothing has to be repeated."""
     ramp = vp.OpenLoop(lambda t: [t - 0.5])
     scene = vp.Scene(slider(1.0), gravity=False)
     motion = vp.simulate(scene, [0.3], [0.0], dt=0.1, steps=10, controls=ramp, integrator=vp.Gauss(2))

@@ -56,11 +56,10 @@ def test_a_linear_quadratic_plan_is_optimal_and_so_is_its_feedback():
     np.testing.assert_allclose(plan.gains[0][:, 3:] @ ROW[0], 0.0, atol=1e-10)
 
 
-def five_bar(**options):
-    drives = np.zeros((4, 2))
-    drives[0, 0] = drives[3, 1] = 1.0
+def five_bar(damping=0.1, **options):
     closed = vp.PointOnPoint("tip", (1.6, 0.0, 0.3), axes="xz")
-    scene = vp.Scene(vp.planar_chain(4), constraints=closed, actuation=drives, **{"damping": 0.1, **options})
+    options |= {"constraints": closed, "actuation": ["joint1", "joint4"], "damping": damping}
+    scene = vp.Scene(vp.planar_chain(4), **options)
     return scene, vp.assemble(scene, [-1.0, 1.0, 1.0, 1.0])
 
 

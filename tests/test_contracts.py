@@ -296,30 +296,6 @@ def test_order(case, integrator, signal):
         assert error[-1] < (1e-2 if integrator.order == 1 else 1e-4), (name, counts, error)
 
 
-# Scenes with kinks in their forces, for which no order is claimed, and how long they last.
-KINKS = {
-    "bounce": (vp.JointStop(400.0, 2.0, -1.0, 0.7, 0.05), (0.3, -0.5), (2.0, -1.0), 1.0),
-    "rest": (vp.CoulombFriction(4.0, 0.05, 6.0, 0.1), (0.3, -0.5), (2.0, -1.0), 1.0),
-    "reach": (vp.PositionServo(80.0, 20.0, 30.0), (0.5, 0.2), (0.0, 0.0), 1.5),
-}
-
-
-@pytest.mark.parametrize("name", KINKS)
-def test_kinks(name):
-    force, q0, v0, duration = KINKS[name]
-    scene = vp.Scene(vp.planar_chain(2), damping=0.1, forces=force)
-    goal = np.array([-0.4, 0.3]) if name == "reach" else np.zeros(2)
-    times = np.linspace(0.0, duration, 5)
-    own = exact(scene, np.array(q0), np.array(v0), times, lambda k, q, v: lambda t: goal)
-    for integrator in (vp.Gauss(2), vp.Radau(2)):
-        motion = vp.simulate(
-            scene, q0, v0, dt=duration / 2000, steps=2000, controls=goal, integrator=integrator, check=False
-        )
-        np.testing.assert_allclose(motion.q[::500], own.q, rtol=0, atol=1e-5)
-        np.testing.assert_allclose(motion.v[::500], own.v, rtol=0, atol=1e-3)
-        np.testing.assert_allclose(motion.energy[::500], own.energy, rtol=0, atol=1e-3)
-
-
 @pytest.mark.parametrize("signal", [SIGNALS[0], *SIGNALS[3:]], ids=lambda signal: signal.name)
 @pytest.mark.parametrize("name", [*SILENT[::5], "stops", "servos", "frame springs"])
 def test_reference(name, signal):
@@ -711,7 +687,6 @@ def test_records(case, integrator, signal, tmp_path):
 
 @over_some
 def test_halves(case, integrator, signal):
-    """A motion that goes on from its middle is the whole motion, under the controls that are left."""
     # Guards that divide a step would begin afresh.
     integrator = dataclasses.replace(integrator, guard=None) if integrator.variational else integrator
     whole, k = motion_of(case, integrator, signal, 6), 3 * PIECES
@@ -738,7 +713,10 @@ def test_halves(case, integrator, signal):
 
 
 # Without inputs, which move along the lines or cubics of each step, whatever the path between its nodes.
-@pytest.mark.parametrize(("case", "integrator", "signal"), [one for one in MOTIONS if one.values[0].path is None])
+FREELY = [one for one in MOTIONS if one.values[0].path is None and not one.marks]
+
+
+@pytest.mark.parametrize(("case", "integrator", "signal"), FREELY)
 def test_error(case, integrator, signal):
     """The error is the distance from the continuous motion; it is told from 1 % of the travel on, not below 0.7 %."""
     own, motion = oracle(case, signal, integrator.variational), motion_of(case, integrator, signal, 5, check=True)

@@ -177,8 +177,6 @@ def test_limits_are_held_against_what_drives_and_stops_do():
     assert not about(said(scene, q, np.zeros(6), 20, controls={"elbow_joint": 0.5}), "effort limits")
     (told,) = about(said(scene, q, np.zeros(6), 20, controls={"elbow_joint": 0.0}), "effort limits")
     assert not unnamed(told, "'elbow_joint'", "150 N m", "4.85e+03")
-    loose = vp.Scene(robot, gravity=False, forces=[vp.JointStop(1e3, lower=-50, upper=50)])
-    assert about(said(loose, [0, 0, 2.9, 0, 0, 0], [0, 0, 6.0, 0, 0, 0], 400), "position limits")
     stiff = vp.Scene(robot, gravity=False, forces=[vp.JointStop(1e5, 1e3)])
     for side in (1.0, -1.0):
         assert not about(said(stiff, [0, 0, 3.0 * side, 0, 0, 0], [0, 0, side, 0, 0, 0], 400), "position limits")
@@ -200,7 +198,6 @@ def test_groups_that_couplings_join():
 
 
 def carrier():
-    """A heavy wheel that carries a light pendulum of two links."""
     model = pin.Model()
     parent = 0
     for k, mass in enumerate((500.0, 0.01, 0.01)):

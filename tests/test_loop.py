@@ -237,7 +237,6 @@ def test_closed_loops(name, kp, kd, steps, unstable):
 
 
 def test_policies():
-    """Constant gains beyond their period are told, the gains of a plan for its horizon are not."""
     for kd, unstable in ((50.0, False), (80.0, True)):
         gains, goals = np.tile([[-1e3, -kd]], (100, 1, 1)), np.tile([1.0, 0.0], (100, 1))
         policy = vp.LinearPolicy(np.zeros((100, 1)), gains, goals, on="velocity")
