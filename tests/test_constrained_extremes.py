@@ -86,7 +86,6 @@ def told(motion):
 
 
 def judged(number, integrator, steps):
-    """Asserts that a loop moves rightly, or that the user is told; whether it moved."""
     try:
         motion, off, rate_off = moved(number, integrator, steps)
     except vp.StepFailure:

@@ -162,7 +162,6 @@ def test_a_crank_that_goes_round_keeps_its_digits():
 
 
 def tangent(scene, q, v):
-    """A basis of the tangent space at (q, p)."""
     n = q.size
     jet = vp.lagrangian_jet(scene, q, v)
     C = scene.constraint_values(q)[1]

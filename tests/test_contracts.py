@@ -266,7 +266,6 @@ MOST = {1: 256, 2: 128, 3: 64, 4: 32, 5: 16, 6: 16, 7: 8, 8: 4, 12: 4}  # parts 
 
 @over_motions
 def test_order(case, integrator, signal):
-    """q, v, energy and work of refined motions converge to the continuous motion with the integrator's order."""
     own = oracle(case, signal, integrator.variational)
     sizes = np.ptp(own.q, axis=0).max(), np.abs(own.v).max(), np.abs(own.energy).max() + np.abs(own.work).max() + 1e-9
     counts, errors = [], []

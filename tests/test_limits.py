@@ -165,7 +165,6 @@ def test_light_parts_that_slide_and_turn_have_sound_balances(integrator):
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)], ids=str)
 @pytest.mark.parametrize("rate", [1.0, 2.5, 10.0])
 def test_what_dies_out_ends_at_rest(integrator, rate):
-    """Down through every power of ten to where squares underflow."""
     scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=rate * 100.0 / 3.0)
     motion = vp.simulate(scene, [0.0], [100.0], dt=1e-2, steps=2000, integrator=integrator)
     assert abs(motion.v[-1, 0]) < 1e-280
