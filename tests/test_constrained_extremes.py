@@ -70,7 +70,6 @@ def exact_motion(number):
 
 
 def moved(number, integrator, steps):
-    """The motion, and how far q and v are off, in units of the way and of the largest velocity."""
     loop, q, v, (exact_q, exact_v) = exact_motion(number)
     controls = None if loop.controls is None else vp.OpenLoop(loop.controls)
     dt = loop.duration / steps

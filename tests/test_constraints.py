@@ -108,7 +108,6 @@ def shake(t):
 
 
 def test_parts_of_a_step_are_under_their_own_torques():
-    """Derivatives in a shift and in a ramp of the torque, of steps that guards take in halves."""
     scene, q, v = loop("four-bar", damping=0.1)
     options = {"controls": vp.OpenLoop(shake), "check": False}
     tight = vp.Gauss(2, guard=vp.Guard(energy_balance=1e-9))

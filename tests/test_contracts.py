@@ -307,7 +307,6 @@ def test_reference(name, signal):
 @pytest.mark.parametrize("driven", [False, True], ids=["nothing", "rows"])
 @pytest.mark.parametrize("name", CONSERVATIVE)
 def test_the_ledger_is_the_drift(name, driven):
-    """energy_defect is the change of energy less the work of held controls, to rounding, in one group of joints."""
     case = zoo.ZOO[name]
     for integrator in (vp.Midpoint(), vp.Gauss(2)):
         motion = motion_of(case, integrator, SIGNALS[1] if driven else SIGNALS[0], 3)
@@ -323,7 +322,6 @@ def test_the_ledger_is_the_drift(name, driven):
     ("name", "c"), [("drifting chain", 0), ("cart", 0), ("ur5", 0), ("kinova", 0), ("frame dampers", 2)]
 )
 def test_momentum(name, c, integrator):
-    """The momentum of a symmetry changes by the impulse of its control, to rounding; where there is none, by more."""
     case = zoo.ZOO[name]
     for signal in SIGNALS[:2]:
         motion = motion_of(case, integrator, signal, 8)
@@ -549,7 +547,6 @@ over_kicks = pytest.mark.parametrize(("name", "integrator"), KICKED, ids=str)
 
 @over_kicks
 def test_kicks(name, integrator):
-    """A noisy step is a step between kicks of the momentum by F dw, or one under the held force F dw / dt."""
     case = zoo.ZOO[name]
     step = Step(case, integrator, False)
     u, dt = step.u, step.dt
@@ -581,7 +578,6 @@ def test_kicks(name, integrator):
 
 @over_kicks
 def test_derivatives_of_kicks(name, integrator):
-    """G against differences in the increments; Gx and Gu are those of the fields, the map J of a jump held."""
     case = zoo.ZOO[name]
     step, rng = Step(case, integrator, False), np.random.default_rng(3)
     n, k = step.n, case.scene.processes
@@ -629,7 +625,6 @@ def test_kicks_along_lines(integrator):
 
 @pytest.mark.parametrize("name", NOISY)
 def test_paths(name):
-    """Paths of one seed are the same bytes, their recorded increments replay them, and refined ones lie near them."""
     case, integrator = zoo.ZOO[name], vp.Midpoint()
     paths = [motion_of(case, integrator, BY_NAME["rows"], 5, rng=seed) for seed in (3, 3, 4)]
     assert paths[0].q.tobytes() == paths[1].q.tobytes() != paths[2].q.tobytes()
@@ -644,7 +639,6 @@ def test_paths(name):
 
 @pytest.mark.parametrize("name", ["pushed joint", "steered joint", "cranked five-bar"])
 def test_inputs_between_calls_of_a_law(name):
-    """Within the period of a law a prescribed joint follows the line or cubic to where the law says it ends."""
     case, parts = zoo.ZOO[name], 3
     late = case.span / PIECES
 
@@ -718,7 +712,8 @@ FREELY = [one for one in MOTIONS if one.values[0].path is None and not one.marks
 @pytest.mark.parametrize(("case", "integrator", "signal"), FREELY)
 def test_error(case, integrator, signal):
     """The error is the distance from the continuous motion; it is told from 1 % of the travel on, not below 0.7 %."""
-    own, motion = oracle(case, signal, integrator.variational), motion_of(case, integrator, signal, 5, check=True)
+    own = oracle(case, signal, integrator.variational)
+    motion = motion_of(case, integrator, signal, 5, check=True)
     off, v_off = np.abs(motion.q[::5] - own.q), np.abs(motion.v[::5] - own.v).max(axis=0)
     rel = 0.5 if case.scene.servo_joints else 0.1
     assert motion.error[::5].max() == pytest.approx(off.max(), rel=rel, abs=1e-9)
@@ -726,7 +721,8 @@ def test_error(case, integrator, signal):
     assert motion.error_bound is None or motion.error_bound > off.max() - 1e-9
     assert not motion.error.flags.writeable
     told = any(finding.kind == "error" for finding in motion.warnings)
-    share, fast = (off / np.ptp(motion.q, axis=0).max()).max(), (v_off / np.abs(own.v).max(axis=0)).max() > 0.2
+    share = off.max() / np.ptp(motion.q, axis=0).max()
+    fast = (v_off / np.abs(own.v).max(axis=0)).max() > 0.2
     assert told or not share > 0.0105
     assert not told or share > 0.007 or fast
 

@@ -67,7 +67,6 @@ def test_problems_take_an_integrator_that_friction_is_not_too_fast_for():
 
 
 def test_verification_under_friction_that_is_too_fast_for_explicit_steps():
-    """The cost of the controls alone, against SciPy's Radau over each control."""
     rough = problem(2e-4)
     plan = vp.solve(rough, max_iterations=15)
     found = plan.verify(tolerance=1e-5, max_substeps=256)
@@ -83,7 +82,6 @@ def test_verification_under_friction_that_is_too_fast_for_explicit_steps():
 
 
 def test_noise_beyond_the_width_of_friction_is_reported():
-    """Linearized friction damps noise that the friction hardly feels."""
     robot = vp.planar_chain(2)
 
     def plan(noise):

@@ -57,7 +57,8 @@ def check_against_naive(scene: vp.Scene, q: np.ndarray, v: np.ndarray, direction
 def test_compiled_is_what_pinocchio_computes(robot):
     q, v = np.random.default_rng(0).normal(0.0, 2.0, (2, robot.dof))
     scene = busy_scene(robot, np.random.default_rng(1))
-    compiled, reference = (vp.lagrangian_jet(scene, q, v, backend=backend) for backend in ("compiled", "pinocchio"))
+    compiled = vp.lagrangian_jet(scene, q, v)
+    reference = vp.lagrangian_jet(scene, q, v, backend="pinocchio")
     for name in NAMES:
         assert_close(getattr(compiled, name), getattr(reference, name), 1e-12, name)
     kinetic = 0.5 * v @ reference.Lvv @ v
@@ -171,7 +172,8 @@ def test_steps_solve_their_equation(tree):
 
 def test_the_branch_margin_is_the_least_ratio_of_pivots(tree):
     """(G1) at the midpoint: of M - (h/2) F_v - h^2 reach L_qq / (1 - margin), with reach 1/4 and margin 1/2, and M."""
-    scene, (q, v), h = vp.Scene(tree, stiffness=0.3, damping=DAMPING, friction=0.0), state_of(tree), 2e-3
+    scene, h = vp.Scene(tree, stiffness=0.3, damping=DAMPING, friction=0.0), 2e-3
+    q, v = state_of(tree)
     # The pivots are those of the last factors, at a guess that is close once there are steps to extrapolate.
     motion = vp.simulate(scene, q, v, dt=h, steps=8, integrator=vp.Midpoint(), check=False)
     assert (motion.statistics.substeps == 1).all()
@@ -186,7 +188,8 @@ def test_the_branch_margin_is_the_least_ratio_of_pivots(tree):
 
 @pytest.mark.parametrize("integrator", [vp.ExplicitEuler(), vp.SemiImplicitEuler()], ids=str)
 def test_accelerations_are_pinocchios(tree, integrator):
-    scene, (q, v), u = vp.Scene(tree, damping=0.0, friction=0.0), state_of(tree), np.cos(np.arange(tree.dof))
+    scene, u = vp.Scene(tree, damping=0.0, friction=0.0), np.cos(np.arange(tree.dof))
+    q, v = state_of(tree)
     motion = vp.simulate(scene, q, v, dt=H, steps=1, controls=u, integrator=integrator, check=False)
     data, at, rates = tree.model.createData(), tree.configuration(q), tree.velocity(v)
     M = jet_of(scene, q, v).Lvv
@@ -199,15 +202,16 @@ def test_accelerations_are_pinocchios(tree, integrator):
 def test_derivatives_of_long_chains_are_those_of_differences():
     scene, n = vp.Scene(vp.planar_chain(60), damping=0.1, stiffness=1.0), 60
     rng = np.random.default_rng(7)
-    q, v, options = rng.uniform(-0.2, 0.2, n), 0.1 * rng.normal(size=n), {"dt": 1e-2, "steps": 1, "check": False}
-    lin = vp.linearize(scene, vp.simulate(scene, q, v, integrator=vp.Midpoint(tolerance=0.1), **options))
+    q, v = rng.uniform(-0.2, 0.2, n), 0.1 * rng.normal(size=n)
+    options = {"dt": 1e-2, "steps": 1, "check": False, "integrator": vp.Midpoint(tolerance=0.1)}
+    lin = vp.linearize(scene, vp.simulate(scene, q, v, **options))
     # Directions dp = M dv, as long ones would take the chain apart.
     M, (dq, dv, du) = vp.lagrangian_jet(scene, q, v).Lvv, 0.1 * rng.normal(size=(3, n))
 
     def end(s):
         at = q + s[0] * dq
         rates = np.linalg.solve(vp.lagrangian_jet(scene, at, v).Lvv, M @ (v + s[0] * dv))
-        moved = vp.simulate(scene, at, rates, controls=s[0] * du, integrator=vp.Midpoint(tolerance=0.1), **options)
+        moved = vp.simulate(scene, at, rates, controls=s[0] * du, **options)
         return np.append(moved.q[1], moved.p[1])
 
     expected = slope(end, np.zeros(1), np.ones(1), 1e-3)

@@ -29,7 +29,6 @@ def friction_noise(n, strength):
 
 
 def test_velocity_dependent_fields():
-    """Their derivatives at fixed momentum enter Gx; the next test has their drift."""
     scene = vp.Scene(vp.load_robot("ur5"), damping=0.1, noise=friction_noise(6, 0.3))
     q, v, u, e, other = np.random.default_rng(0).uniform(-1, 1, (5, 6))
     options = {"dt": 1e-3, "steps": 1, "controls": u, "integrator": vp.Midpoint(), "check": False}
@@ -82,7 +81,6 @@ def test_noisy_motions_are_linearized_at_zero_noise(integrator, custom):
 
 
 def test_moments_against_samples():
-    """Closed-form mean and covariance within 4 standard errors of 5e4 sampled linearizations."""
     noise = vp.AdditiveNoise(3e-6) + vp.StateNoise(2e-4, center=0.0)
     scene = vp.Scene(vp.load_robot("finger"), damping=1e-6, stiffness=5e-6, noise=noise)
     motion = vp.simulate(scene, [0.4, 0.3, 0.2], [0.0, 0.0, 0.0], dt=5e-3, steps=12)
@@ -219,7 +217,8 @@ def test_derivatives_are_those_of_the_parts_taken(name, integrator, seed):
     given = np.hstack([lin.A[k], lin.B[k]]) * units / units[: 2 * n, None]
 
     def end(y):
-        return composed(scene, integrator, motion.dt, parts_of(motion)[k], y[:n], y[n : 2 * n], y[2 * n :])
+        q, p, u = np.split(y, 3)
+        return composed(scene, integrator, motion.dt, parts_of(motion)[k], q, p, u)
 
     for block in (slice(0, 2 * n), slice(2 * n, 3 * n)):
         e = np.zeros(3 * n)
@@ -235,7 +234,8 @@ def test_second_derivatives_are_those_of_the_parts_taken(name, integrator, seed)
     k = next(taken_otherwise(scene, motion, integrator))
     step, n, rng = motion.part(k, k + 1), scene.robot.dof, np.random.default_rng(seed)
     units = units_of(scene, step.q[0], step.v[0])
-    z, e, other = rng.normal(size=2 * n) / units[: 2 * n], *(rng.uniform(-1.0, 1.0, (2, 3 * n)) * units)
+    z = rng.normal(size=2 * n) / units[: 2 * n]
+    e, other = rng.uniform(-1.0, 1.0, (2, 3 * n)) * units
     second = vp.second_order(scene, step, z)
     given = np.block([[second.xx[0], second.ux[0].T], [second.ux[0], second.uu[0]]])
 
@@ -244,13 +244,13 @@ def test_second_derivatives_are_those_of_the_parts_taken(name, integrator, seed)
         lin = vp.linearize(scene, replace(step, q=q, p=p, u=y[None, 2 * n :]))
         return z @ np.hstack([lin.A[0], lin.B[0]]) @ other
 
-    size = 3e-3 / max(1.0, np.abs(vp.linearize(scene, step).A[0] * units[: 2 * n] / units[: 2 * n, None]).max())
-    expected = slope(gradient, np.concatenate([step.q[0], step.p[0], step.u[0]]), e, size)
+    A = vp.linearize(scene, step).A[0] * units[: 2 * n] / units[: 2 * n, None]
+    point = np.concatenate([step.q[0], step.p[0], step.u[0]])
+    expected = slope(gradient, point, e, 3e-3 / max(1.0, np.abs(A).max()))
     assert abs(other @ given @ e - expected) < 1e-7 * np.abs(given * np.outer(units, units)).max()
 
 
 def test_parts_are_kept_however_a_motion_is_made():
-    """In one rollout, a step at a time under a law, and up to a step that fails."""
     integrator = vp.Midpoint()
     scene, motion = moving("finger", integrator, 1)
     expected = motion.statistics
@@ -268,7 +268,6 @@ def test_parts_are_kept_however_a_motion_is_made():
 
 @pytest.mark.parametrize("kick", ["left", "split"])
 def test_noisy_steps_are_taken_in_parts_without_their_kick(kick):
-    """Weak noise, by differences of the same parts from the node without its kick."""
     integrator = vp.Midpoint(kick=kick)
     scene, motion = moving("double_pendulum", integrator, 0, noise=vp.AdditiveNoise(0.05), rng=3)
     assert motion.dw.any()
@@ -276,7 +275,8 @@ def test_noisy_steps_are_taken_in_parts_without_their_kick(kick):
     checked = 0
     for k, halvings in enumerate(parts_of(motion)[:4]):
         units = units_of(scene, motion.q[k], motion.v[k])[:4]
-        e, lengths = units * np.random.default_rng(k).uniform(-1.0, 1.0, 4), halvings if len(halvings) else [0]
+        e = units * np.random.default_rng(k).uniform(-1.0, 1.0, 4)
+        lengths = halvings if len(halvings) else [0]
 
         def end(y, k=k, lengths=lengths):
             return composed(scene, integrator, motion.dt, lengths, y[:2], y[2:], motion.u[k])

@@ -95,7 +95,6 @@ def test_fields_are_as_defined_and_have_their_derivatives(name):
 
 
 def test_state_noise_is_centred_on_the_start_of_the_motion():
-    """For a motion in one go and each path of an ensemble, and not on where later steps stand."""
     start, end = np.array([0.4, -0.9]), {"dt": 0.01, "steps": 60, "rng": 3}
     given = vp.simulate(chain(vp.StateNoise(0.8, center=start)), start, [1.0, 0.0], **end)
     left_out = vp.simulate(chain(vp.StateNoise(0.8)), start, [1.0, 0.0], **end)
@@ -213,7 +212,8 @@ def test_python_and_compiled_fields_give_the_same_motion(kick):
     added, state = vp.AdditiveNoise(0.2), vp.StateNoise(0.7, center=[0.5, 0.0])
     own = vp.CustomNoise(lambda q, v, u: np.diag(0.7 * (q - [0.5, 0.0]) ** 2), 2)
     options = {"dt": 0.01, "steps": 200, "rng": 1, "integrator": vp.Midpoint(kick=kick)}
-    one, other = (vp.simulate(chain(added + part), [0.3, 0.2], [0, 1], **options) for part in (state, own))
+    scenes = [chain(added + part) for part in (state, own)]
+    one, other = (vp.simulate(scene, [0.3, 0.2], [0, 1], **options) for scene in scenes)
     assert other.dw.tobytes() == one.dw.tobytes()
     for name in ("q", "v", "p", "energy"):
         np.testing.assert_allclose(getattr(other, name), getattr(one, name), rtol=0, atol=1e-10)
@@ -226,7 +226,8 @@ def test_python_and_compiled_fields_give_the_same_motion(kick):
 def test_the_mean_of_noise_in_proportion_to_the_velocity(integrator, dv):
     """Over two steps of the noise with the moments of a normal one: dv = s v o dw has the mean v exp(s^2 t / 2)."""
     M, s, dt = vp.lagrangian_jet(vp.Scene(vp.planar_chain(1)), [0.0], [0.0]).Lvv[0, 0], 0.3, 0.01
-    noise = vp.CustomNoise(lambda q, v, u: [[s * M * v[0]]], 1, dv=(lambda q, v, u: [[[s * M]]]) if dv else None)
+    slopes = (lambda q, v, u: [[[s * M]]]) if dv else None
+    noise = vp.CustomNoise(lambda q, v, u: [[s * M * v[0]]], 1, dv=slopes)
     scene = vp.Scene(vp.planar_chain(1), noise=noise, gravity=False)
     ends = [
         vp.simulate(scene, [0.5], [1.0], dt=dt, steps=1, integrator=integrator, increments=[[dw]], check=False).v[1, 0]
@@ -239,7 +240,6 @@ def test_the_mean_of_noise_in_proportion_to_the_velocity(integrator, dv):
 
 
 def test_noise_of_controls_within_a_step_is_that_of_their_mean():
-    """A control that grows over the step by du has a mean that is du / 2 larger."""
     scene, start = chain(vp.ControlNoise(0.3), damping=0.1), ([0.3, 0.2], [0.0, 1.0])
     push = vp.OpenLoop(lambda t: [np.sin(9.0 * t), 1.0])
     motion = vp.simulate(scene, *start, dt=0.02, steps=4, controls=push, integrator=vp.Gauss(2), increments=0.0)
