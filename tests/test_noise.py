@@ -155,7 +155,6 @@ def test_a_wrong_or_missing_derivative_is_named(wrong, left_out):
     ],
 )
 def test_what_a_field_returns_is_checked(slots, facts):
-    """With the check when the scene is made, and without it when the motion needs the field."""
     slots = {"field": lambda q, v, u: np.eye(2), "processes": 2} | slots
     with refused(vp.NoiseFieldError, facts):
         chain(vp.CustomNoise(**slots, check=True))
