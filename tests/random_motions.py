@@ -96,7 +96,8 @@ def draw(seed: int) -> Case:
     """The task of a seed, whose kind follows from the seed, too."""
     rng, kind = np.random.default_rng(seed), KINDS[seed % len(KINDS)]
     robot, gravity = any_robot(rng), np.array([0.0, 0.0, -9.81]) * (kind == "upright" or rng.random() < 0.7)
-    free, n, unit = vp.Scene(robot, gravity=gravity, damping=0.0), robot.dof, np.where(robot.slides, 0.3, 1.0)
+    free, n = vp.Scene(robot, gravity=gravity, damping=0.0), robot.dof
+    unit = np.where(robot.slides, 0.3, 1.0)
     dt = float(log_uniform(rng, 1e-3, 0.05))
     steps = max(4, round(rng.uniform(0.2, 2.0) / dt))
     q0, v0 = unit * rng.uniform(-1.5, 1.5, n), unit * rng.normal(size=n) * log_uniform(rng, 0.05, 5.0)

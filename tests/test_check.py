@@ -43,7 +43,6 @@ def agree(motion, q, rel=0.05, least=1e-10):
 
 
 def right():
-    """A motion that the gate lets pass, whose error is not yet computed."""
     motion = moved(FREE, dt=0.005, steps=100)
     assert "error about" in repr(motion)
     assert 0.0 < motion.error_bound < 1e-4
@@ -51,7 +50,6 @@ def right():
 
 
 def test_lazy_error(tmp_path):
-    """It is computed when it is asked for, the same however the motion got there."""
     motion, own = right(), right()
     known = motion.error
     assert f"error {known.max():.2g}" in repr(motion)
@@ -82,20 +80,23 @@ def test_no_check():
     assert moved(FREE, start=([0.5 * np.pi, 0.0, 0.0], np.zeros(3))).error.max() < 1e-9
 
 
-@pytest.mark.parametrize("integrator", [MIDPOINT, vp.Midpoint(kick="held"), vp.Gauss(2), vp.Radau(3), RK4, EULER])
+KICKED = [MIDPOINT, vp.Midpoint(kick="held"), vp.Gauss(2), vp.Radau(3), RK4, EULER, vp.ExplicitEuler()]
+
+
+@pytest.mark.parametrize("integrator", KICKED, ids=str)
 def test_noise(integrator):
-    """The repetition has the same increments: against the same path in many more steps."""
     scene = vp.Scene(CHAIN, damping=0.5, noise=vp.AdditiveNoise(0.5))
     dw, parts = np.sqrt(0.02) * np.random.default_rng(0).normal(size=(40, 3)), 32
     held = getattr(integrator, "kick", "left") == "held"
     fine = np.kron(dw, np.full((parts, 1), 1.0 / parts) if held else np.eye(parts, 1))
     fine = {"increments": fine, "dt": 0.02 / parts, "steps": 40 * parts, "check": False}
     truth = moved(scene, vp.Gauss(4, kick="held" if held else "left"), **fine).q[::parts]
-    agree(moved(scene, integrator, increments=dw), truth)
+    # Its repetition takes half steps, and has a half of the error to first order.
+    rel = 0.3 if integrator == vp.ExplicitEuler() else 0.05
+    agree(moved(scene, integrator, increments=dw), truth, rel=rel)
 
 
 def test_kinematic_inputs():
-    """A joint moved by hand moves evenly within the steps of the motion, in its repetition too."""
     scene = vp.Scene(CHAIN, constraints=vp.KinematicInput("joint1"), actuation=["joint1"])
     t, start = 0.02 * np.arange(41), (Q0, np.array([1.2, 0.0, 1.0]))
     motion = moved(scene, MIDPOINT, controls=vp.OpenLoop(lambda t: [0.3 + 0.3 * np.sin(4.0 * t)]), start=start)
@@ -103,6 +104,23 @@ def test_kinematic_inputs():
     np.testing.assert_allclose(motion.q[1:, 0], 0.3 + 0.3 * np.sin(4.0 * t[1:]), atol=1e-14)
     line = vp.OpenLoop(lambda s: [np.interp(s, t, 0.3 + 0.3 * np.sin(4.0 * t))])
     agree(motion, finer(scene, motion, line, start=start))
+
+
+@pytest.mark.parametrize(
+    ("force", "integrator", "dt"),
+    [
+        (vp.CoulombFriction(0.5), RK4, 0.005),
+        (vp.JointStop(1e3, 5.0, -0.8, 0.8), None, 0.02),
+    ],
+)
+def test_forces_sharper_than_the_step(force, integrator, dt):
+    """More stages do not resolve kinks: the repetition must not be off alike."""
+    scene = vp.Scene(vp.load_robot("ur5"), damping=0.2, friction=0, forces=force)
+    for seed in range(4):
+        start = np.full(6, 0.5), np.random.default_rng(seed).uniform(-2.0, 2.0, 6)
+        motion = moved(scene, integrator, dt=dt, steps=50, start=start)
+        true = finer(scene, motion, parts=64, integrator=vp.Radau(4), start=start)
+        assert 0.8 < motion.error.max() / np.abs(motion.q - true).max() < 1.25
 
 
 def test_chaos():
@@ -237,7 +255,6 @@ def test_the_step_named_for_a_stop_is_as_long_as_its_spring_allows(stiffness):
 
 
 def test_limits():
-    """One warning for each kind, about the joint that passes it by most, and the number of the others."""
     scene = vp.Scene(vp.load_robot("ur5"), gravity=False)
     robot, push = scene.robot, np.array([400.0, 0.0, 0.0, 40.0, 50.0, 60.0])
     motion = moved(scene, dt=1e-3, start=(np.full(6, 7.0), np.arange(1.0, 7.0)), controls=push)
@@ -258,7 +275,6 @@ def test_limits():
 
 
 def test_log(caplog):
-    """One line: the worst and the number of the others; nothing twice for a scene and a step; silent if asked to."""
     scene, start = vp.Scene(vp.load_robot("ur5"), gravity=False), (np.full(6, 7.0), np.arange(1.0, 7.0))
 
     def lines(scene=scene, **options):
@@ -352,6 +368,13 @@ def test_the_second_part_of_a_split_kick_has_the_field_at_the_end_of_its_step():
     assert motion.error.max() < 1e-9
 
 
+def test_friction_that_turns_in_a_step_is_repeated_on_either_side():
+    scene = vp.Scene(slider(1.0), gravity=False, forces=vp.CoulombFriction(0.01, 0.1))
+    for speed in (1.0, -1.0):
+        motion = vp.simulate(scene, [0.0], [speed], dt=0.05, steps=20, controls=[-2.0 * speed])
+        assert motion.error_bound is None
+
+
 def test_a_joint_that_hardly_turns_is_measured_by_the_others():
     scene = vp.Scene(vp.planar_chain(2), gravity=False, stiffness=[0.0, 1e3])
     assert not vp.simulate(scene, [0.0, 4e-5], [1.0, 0.0], dt=0.02, steps=50, integrator=MIDPOINT).warnings
@@ -369,7 +392,6 @@ def test_a_slide_that_hardly_moves_is_measured_by_the_arm_that_turns():
 
 
 def test_a_ramp_is_the_polynomial_of_two_stages():
-    """Nothing has to be repeated."""
     ramp = vp.OpenLoop(lambda t: [t - 0.5])
     scene = vp.Scene(slider(1.0), gravity=False)
     motion = vp.simulate(scene, [0.3], [0.0], dt=0.1, steps=10, controls=ramp, integrator=vp.Gauss(2))

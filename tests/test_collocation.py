@@ -53,7 +53,8 @@ def test_energy_round_off_walks_at_random(stages):
 @pytest.mark.parametrize("kind", [vp.Gauss, vp.Radau])
 def test_a_damper_is_slowed_by_the_pade_approximant(kind, stages):
     """One step multiplies v by that of exp(z), z = -h d / I, whose numerator has a degree less for Radau's methods."""
-    scene, degree = vp.Scene(vp.planar_chain(1), gravity=False, damping=1.0), stages - (kind is vp.Radau)
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=1.0)
+    degree = stages - (kind is vp.Radau)
     inertia = vp.lagrangian_jet(scene, [0.0], [0.0]).Lvv[0, 0]
     for z in (-0.3, -5.0, -3e3):
         motion = vp.simulate(
@@ -67,7 +68,8 @@ def test_a_damper_is_slowed_by_the_pade_approximant(kind, stages):
 def test_one_stage_is_the_implicit_euler_method():
     """p1 = p0 + h (L_q + F) at the end of the step."""
     scene, h = vp.Scene(vp.planar_chain(3), damping=0.1), 2e-3
-    motion = vp.simulate(scene, np.zeros(3), np.ones(3), dt=h, steps=1, integrator=vp.Radau(1, guard=None))
+    start = np.zeros(3), np.ones(3)
+    motion = vp.simulate(scene, *start, dt=h, steps=1, integrator=vp.Radau(1, guard=None))
     v = (motion.q[1] - motion.q[0]) / h
     slope = vp.lagrangian_jet(scene, motion.q[1], v).Lq - 0.1 * v
     np.testing.assert_allclose(motion.p[1] - motion.p[0], h * slope, rtol=0, atol=1e-12)
@@ -252,16 +254,8 @@ def test_a_correction_that_leaves_nothing_is_not_looked_at(name, integrator):
             ({"stages": "two"}, ("stages", "'two'")),
             ({"guard": 3}, ("guard", "varpin.Guard", "None", "3")),
         )),
-        *((kind, *own) for kind in (vp.Gauss, vp.Radau, vp.Midpoint) for own in (
-            ({"tolerance": 0.0}, ("tolerance", "0.0")),
-            ({"kick": "right"}, ("kick", "'left'", "'split'", "'right'")),
-        )),
-        (vp.Midpoint, {"alpha": 1.5}, ("alpha", "[0, 1]", "1.5")),
-        (vp.Guard, {"branch_margin": 1.0}, ("branch_margin", "[0, 1)", "1")),
-        (vp.Guard, {"energy_balance": -1.0}, ("energy_balance", "-1.0")),
-        (vp.Guard, {"energy_budget": np.nan}, ("energy_budget", "nan")),
         (vp.Guard, {"max_halvings": 31}, ("max_halvings", "30", "31")),
-        (vp.Guard, {"max_halvings": 1.5}, ("max_halvings", "1.5")),
+        (vp.Radau, {"kick": "right"}, ("kick", "'left'", "'split'", "'right'")),
     ],
 )  # fmt: skip
 def test_options_out_of_range(kind, option, facts):

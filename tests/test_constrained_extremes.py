@@ -70,7 +70,6 @@ def exact_motion(number):
 
 
 def moved(number, integrator, steps):
-    """The motion, and how far q and v are off, in units of the way and of the largest velocity."""
     loop, q, v, (exact_q, exact_v) = exact_motion(number)
     controls = None if loop.controls is None else vp.OpenLoop(loop.controls)
     dt = loop.duration / steps
@@ -86,7 +85,6 @@ def told(motion):
 
 
 def judged(number, integrator, steps):
-    """Asserts that a loop moves rightly, or that the user is told; whether it moved."""
     try:
         motion, off, rate_off = moved(number, integrator, steps)
     except vp.StepFailure:
@@ -121,7 +119,6 @@ def test_loops_at_their_extremes_over_decades_of_steps(number):
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)])
 def test_light_links_that_carry_a_heavy_one_take_long_steps(integrator):
-    """In the metric of their kinetic energy a small turn is large; the loop is as far from a toggle as any."""
     (number,) = (k for k, made in enumerate(LOOPS) if made().name == "links of 1e-06 and 10000 kg")
     motion, off, rate_off = moved(number, integrator, 3)
     assert motion.statistics.split_steps == 0

@@ -4,7 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import zoo
-from oracles import Mechanism, slope
+from oracles import Mechanism, placements, slope
 from refusals import refused, unnamed
 from scipy.optimize import minimize
 
@@ -29,7 +29,6 @@ def violations(scene, trajectory):
 
 
 def circle(q):
-    """The first two joints on an ellipse."""
     return [q[0] ** 2 + 2.0 * q[1] ** 2 - 1.0]
 
 
@@ -81,10 +80,7 @@ def test_rows_have_the_derivatives_of_their_values(arm, kind):
 
 def test_rows_mean_what_pinocchio_says(arm):
     q = np.random.default_rng(1).normal(size=6)
-    model = arm.model
-    data = model.createData()
-    pin.framesForwardKinematics(model, data, q)
-    tool, upper = (data.oMf[model.getFrameId(name)] for name in ("tool0", "upper_arm_link"))
+    ((tool,), (upper,)) = (placements(arm, q[None], name) for name in ("tool0", "upper_arm_link"))
     place = upper.act(np.array([0.1, 0.0, 0.2]))
 
     def value(kind):
@@ -112,7 +108,6 @@ def shake(t):
 
 
 def test_parts_of_a_step_are_under_their_own_torques():
-    """Derivatives in a shift and in a ramp of the torque, of steps that guards take in halves."""
     scene, q, v = loop("four-bar", damping=0.1)
     options = {"controls": vp.OpenLoop(shake), "check": False}
     tight = vp.Gauss(2, guard=vp.Guard(energy_balance=1e-9))
@@ -166,7 +161,6 @@ def test_a_crank_that_goes_round_keeps_its_digits():
 
 
 def tangent(scene, q, v):
-    """A basis of the tangent space at (q, p)."""
     n = q.size
     jet = vp.lagrangian_jet(scene, q, v)
     C = scene.constraint_values(q)[1]
@@ -240,7 +234,7 @@ def test_a_weld_that_is_turned_round_is_none():
         vp.assemble(vp.Scene(robot, constraints=vp.FrameOnFrame("joint1", "universe", POSE)), [0.3])
     # They vanish at a third of a turn about a diagonal, too.
     arm, start = vp.load_robot("ur5"), np.array([0.2, -1.2, 1.5, -0.3, 1.4, 0.1])
-    place = frame_placement(arm, start, "tool0")
+    place = placements(arm, start[None], "tool0")[0].homogeneous
     third = place.copy()
     third[:3] = place[[2, 0, 1]]
     third[:3, 3] = place[:3, 3]
@@ -249,13 +243,7 @@ def test_a_weld_that_is_turned_round_is_none():
     with refused(vp.AssemblyError, "FrameOnFrame", "1.571"):
         vp.simulate(scene, start, np.zeros(6), dt=1e-2, steps=1)
     q = vp.assemble(scene, start)
-    np.testing.assert_allclose(frame_placement(arm, q, "tool0"), third, atol=1e-12)
-
-
-def frame_placement(robot, q, frame):
-    data = robot.model.createData()
-    pin.framesForwardKinematics(robot.model, data, robot.configuration(q))
-    return data.oMf[robot.model.getFrameId(frame)].homogeneous
+    np.testing.assert_allclose(placements(arm, q[None], "tool0")[0].homogeneous, third, atol=1e-12)
 
 
 @pytest.mark.parametrize("ground", [1.01, 1.1])

@@ -266,7 +266,6 @@ MOST = {1: 256, 2: 128, 3: 64, 4: 32, 5: 16, 6: 16, 7: 8, 8: 4, 12: 4}  # parts 
 
 @over_motions
 def test_order(case, integrator, signal):
-    """q, v, energy and work of refined motions converge to the continuous motion with the integrator's order."""
     own = oracle(case, signal, integrator.variational)
     sizes = np.ptp(own.q, axis=0).max(), np.abs(own.v).max(), np.abs(own.energy).max() + np.abs(own.work).max() + 1e-9
     counts, errors = [], []
@@ -296,30 +295,6 @@ def test_order(case, integrator, signal):
         assert error[-1] < (1e-2 if integrator.order == 1 else 1e-4), (name, counts, error)
 
 
-# Scenes with kinks in their forces, for which no order is claimed, and how long they last.
-KINKS = {
-    "bounce": (vp.JointStop(400.0, 2.0, -1.0, 0.7, 0.05), (0.3, -0.5), (2.0, -1.0), 1.0),
-    "rest": (vp.CoulombFriction(4.0, 0.05, 6.0, 0.1), (0.3, -0.5), (2.0, -1.0), 1.0),
-    "reach": (vp.PositionServo(80.0, 20.0, 30.0), (0.5, 0.2), (0.0, 0.0), 1.5),
-}
-
-
-@pytest.mark.parametrize("name", KINKS)
-def test_kinks(name):
-    force, q0, v0, duration = KINKS[name]
-    scene = vp.Scene(vp.planar_chain(2), damping=0.1, forces=force)
-    goal = np.array([-0.4, 0.3]) if name == "reach" else np.zeros(2)
-    times = np.linspace(0.0, duration, 5)
-    own = exact(scene, np.array(q0), np.array(v0), times, lambda k, q, v: lambda t: goal)
-    for integrator in (vp.Gauss(2), vp.Radau(2)):
-        motion = vp.simulate(
-            scene, q0, v0, dt=duration / 2000, steps=2000, controls=goal, integrator=integrator, check=False
-        )
-        np.testing.assert_allclose(motion.q[::500], own.q, rtol=0, atol=1e-5)
-        np.testing.assert_allclose(motion.v[::500], own.v, rtol=0, atol=1e-3)
-        np.testing.assert_allclose(motion.energy[::500], own.energy, rtol=0, atol=1e-3)
-
-
 @pytest.mark.parametrize("signal", [SIGNALS[0], *SIGNALS[3:]], ids=lambda signal: signal.name)
 @pytest.mark.parametrize("name", [*SILENT[::5], "stops", "servos", "frame springs"])
 def test_reference(name, signal):
@@ -332,7 +307,6 @@ def test_reference(name, signal):
 @pytest.mark.parametrize("driven", [False, True], ids=["nothing", "rows"])
 @pytest.mark.parametrize("name", CONSERVATIVE)
 def test_the_ledger_is_the_drift(name, driven):
-    """energy_defect is the change of energy less the work of held controls, to rounding, in one group of joints."""
     case = zoo.ZOO[name]
     for integrator in (vp.Midpoint(), vp.Gauss(2)):
         motion = motion_of(case, integrator, SIGNALS[1] if driven else SIGNALS[0], 3)
@@ -348,7 +322,6 @@ def test_the_ledger_is_the_drift(name, driven):
     ("name", "c"), [("drifting chain", 0), ("cart", 0), ("ur5", 0), ("kinova", 0), ("frame dampers", 2)]
 )
 def test_momentum(name, c, integrator):
-    """The momentum of a symmetry changes by the impulse of its control, to rounding; where there is none, by more."""
     case = zoo.ZOO[name]
     for signal in SIGNALS[:2]:
         motion = motion_of(case, integrator, signal, 8)
@@ -574,7 +547,6 @@ over_kicks = pytest.mark.parametrize(("name", "integrator"), KICKED, ids=str)
 
 @over_kicks
 def test_kicks(name, integrator):
-    """A noisy step is a step between kicks of the momentum by F dw, or one under the held force F dw / dt."""
     case = zoo.ZOO[name]
     step = Step(case, integrator, False)
     u, dt = step.u, step.dt
@@ -606,7 +578,6 @@ def test_kicks(name, integrator):
 
 @over_kicks
 def test_derivatives_of_kicks(name, integrator):
-    """G against differences in the increments; Gx and Gu are those of the fields, the map J of a jump held."""
     case = zoo.ZOO[name]
     step, rng = Step(case, integrator, False), np.random.default_rng(3)
     n, k = step.n, case.scene.processes
@@ -654,7 +625,6 @@ def test_kicks_along_lines(integrator):
 
 @pytest.mark.parametrize("name", NOISY)
 def test_paths(name):
-    """Paths of one seed are the same bytes, their recorded increments replay them, and refined ones lie near them."""
     case, integrator = zoo.ZOO[name], vp.Midpoint()
     paths = [motion_of(case, integrator, BY_NAME["rows"], 5, rng=seed) for seed in (3, 3, 4)]
     assert paths[0].q.tobytes() == paths[1].q.tobytes() != paths[2].q.tobytes()
@@ -669,7 +639,6 @@ def test_paths(name):
 
 @pytest.mark.parametrize("name", ["pushed joint", "steered joint", "cranked five-bar"])
 def test_inputs_between_calls_of_a_law(name):
-    """Within the period of a law a prescribed joint follows the line or cubic to where the law says it ends."""
     case, parts = zoo.ZOO[name], 3
     late = case.span / PIECES
 
@@ -711,7 +680,6 @@ def test_records(case, integrator, signal, tmp_path):
 
 @over_some
 def test_halves(case, integrator, signal):
-    """A motion that goes on from its middle is the whole motion, under the controls that are left."""
     # Guards that divide a step would begin afresh.
     integrator = dataclasses.replace(integrator, guard=None) if integrator.variational else integrator
     whole, k = motion_of(case, integrator, signal, 6), 3 * PIECES
@@ -738,10 +706,14 @@ def test_halves(case, integrator, signal):
 
 
 # Without inputs, which move along the lines or cubics of each step, whatever the path between its nodes.
-@pytest.mark.parametrize(("case", "integrator", "signal"), [one for one in MOTIONS if one.values[0].path is None])
+FREELY = [one for one in MOTIONS if one.values[0].path is None and not one.marks]
+
+
+@pytest.mark.parametrize(("case", "integrator", "signal"), FREELY)
 def test_error(case, integrator, signal):
     """The error is the distance from the continuous motion; it is told from 1 % of the travel on, not below 0.7 %."""
-    own, motion = oracle(case, signal, integrator.variational), motion_of(case, integrator, signal, 5, check=True)
+    own = oracle(case, signal, integrator.variational)
+    motion = motion_of(case, integrator, signal, 5, check=True)
     off, v_off = np.abs(motion.q[::5] - own.q), np.abs(motion.v[::5] - own.v).max(axis=0)
     rel = 0.5 if case.scene.servo_joints else 0.1
     assert motion.error[::5].max() == pytest.approx(off.max(), rel=rel, abs=1e-9)
@@ -749,7 +721,8 @@ def test_error(case, integrator, signal):
     assert motion.error_bound is None or motion.error_bound > off.max() - 1e-9
     assert not motion.error.flags.writeable
     told = any(finding.kind == "error" for finding in motion.warnings)
-    share, fast = (off / np.ptp(motion.q, axis=0).max()).max(), (v_off / np.abs(own.v).max(axis=0)).max() > 0.2
+    share = off.max() / np.ptp(motion.q, axis=0).max()
+    fast = (v_off / np.abs(own.v).max(axis=0)).max() > 0.2
     assert told or not share > 0.0105
     assert not told or share > 0.007 or fast
 

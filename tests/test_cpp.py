@@ -101,7 +101,6 @@ def test_the_example_finds_the_core_in_the_tree_and_installed(configured, tmp_pa
 
 
 def test_plan_of_the_example_is_what_python_finds(configured, tmp_path):
-    """To the last bit."""
     build = configured("build")
     subprocess.run(["cmake", "--build", build], check=True)
     done = subprocess.run([build / "plan", tmp_path / "found"], check=True, capture_output=True, text=True)

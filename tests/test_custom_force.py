@@ -46,7 +46,8 @@ def test_holding():
     own = vp.Scene(ROBOT, forces=vp.CustomForce(lambda q, v: np.array([1.0, -2.0, 0.5]) + v))
     torque = vp.Scene(ROBOT).holding_torque(Q0) - [1.0, -2.0, 0.5]
     np.testing.assert_allclose(own.holding_torque(Q0), torque, atol=1e-12)
-    held = vp.simulate(own, Q0, np.zeros(3), dt=0.01, steps=3, controls=own.holding_controls(Q0), check=False)
+    controls = own.holding_controls(Q0)
+    held = vp.simulate(own, Q0, np.zeros(3), dt=0.01, steps=3, controls=controls, check=False)
     np.testing.assert_allclose(held.q, np.tile(Q0, (4, 1)), atol=1e-12)
 
 

@@ -115,7 +115,6 @@ def blocks(language):
 
 @pytest.mark.slow
 def test_a_force_of_the_core_is_a_struct_and_its_name(tmp_path):
-    """The page's struct and its list of kinds in the header, that core built, and the page's class on it."""
     root = PAGE.parents[1]
     for name in ("src", "models"):
         shutil.copytree(root / name, tmp_path / name, ignore=shutil.ignore_patterns("*.so", "__pycache__"))

@@ -34,7 +34,8 @@ def test_each_against_its_formula(name):
         assert own.Lq - other.Lq == pytest.approx(pull, rel=1e-12, abs=1e-13)
         bend = slope(lambda x, rate=rate: plain(x, rate, drive)[1], at, one, 1e-4)
         assert own.Lqq[0] - other.Lqq[0] == pytest.approx(bend, rel=1e-9, abs=1e-9)
-        value, by_q, by_v, lost = (array[0] for array in scene.core.forces(at[None], rate[None], drive[None]))
+        arrays = scene.core.forces(at[None], rate[None], drive[None])
+        value, by_q, by_v, lost = (array[0] for array in arrays)
         assert value == pytest.approx(rest - drive, rel=1e-13, abs=1e-15)
         found = slope(lambda x, rate=rate: plain(x, rate, drive)[2], at, one, 1e-3)
         assert by_q == pytest.approx(found, rel=1e-9, abs=1e-11)
@@ -177,8 +178,6 @@ def test_limits_are_held_against_what_drives_and_stops_do():
     assert not about(said(scene, q, np.zeros(6), 20, controls={"elbow_joint": 0.5}), "effort limits")
     (told,) = about(said(scene, q, np.zeros(6), 20, controls={"elbow_joint": 0.0}), "effort limits")
     assert not unnamed(told, "'elbow_joint'", "150 N m", "4.85e+03")
-    loose = vp.Scene(robot, gravity=False, forces=[vp.JointStop(1e3, lower=-50, upper=50)])
-    assert about(said(loose, [0, 0, 2.9, 0, 0, 0], [0, 0, 6.0, 0, 0, 0], 400), "position limits")
     stiff = vp.Scene(robot, gravity=False, forces=[vp.JointStop(1e5, 1e3)])
     for side in (1.0, -1.0):
         assert not about(said(stiff, [0, 0, 3.0 * side, 0, 0, 0], [0, 0, side, 0, 0, 0], 400), "position limits")
@@ -200,7 +199,6 @@ def test_groups_that_couplings_join():
 
 
 def carrier():
-    """A heavy wheel that carries a light pendulum of two links."""
     model = pin.Model()
     parent = 0
     for k, mass in enumerate((500.0, 0.01, 0.01)):

@@ -1,6 +1,8 @@
-"""Dry friction: arms that come to rest, and steps that friction is too fast for."""
+"""What integrates a motion where nobody says what; and dry friction that is too fast for steps."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,18 +14,12 @@ from varpin.simulation.spectrum import rate_at_rest
 
 
 def block(width, level=1.0):
-    """One link without gravity, which dry friction brings to rest."""
     return vp.Scene(vp.planar_chain(1), gravity=False, forces=vp.CoulombFriction(level, width))
-
-
-def own(motion):
-    return about(motion.warnings, "error")
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.Gauss(4), vp.Radau(2), vp.Radau(3)], ids=str)
 @pytest.mark.parametrize("width", [1e-1, 1e-3, 1e-5])
 def test_friction_never_adds_energy(integrator, width):
-    """Whatever the width is in steps."""
     for v0 in (2.0, 2.005, 2.013):
         motion = vp.simulate(block(width), [0.0], [v0], dt=1e-2, steps=120, integrator=integrator)
         assert np.diff(motion.energy).max() <= 1e-14
@@ -40,13 +36,13 @@ def test_friction_so_fast_that_steps_take_very_short_parts():
     motion = vp.simulate(scene, begin, speed, dt=2e-2, steps=30, integrator=vp.RungeKutta4())
     # Friction holds the last joint after 0.08 s.
     assert np.abs(motion.v[5:, 5]).max() > 0.3
-    assert own(motion)
+    assert about(motion.warnings, "error")
 
 
 def test_joints_that_do_not_stop_are_quiet():
     sliding = vp.simulate(block(1e-5, 0.1), [0.0], [2.0], dt=1e-2, steps=100)
     resting = vp.simulate(block(1e-5), [0.0], [0.0], dt=1e-2, steps=100)
-    assert own(sliding) == own(resting) == []
+    assert about(sliding.warnings, "error") == about(resting.warnings, "error") == []
 
 
 def problem(width, dt=0.02):
@@ -71,7 +67,6 @@ def test_problems_take_an_integrator_that_friction_is_not_too_fast_for():
 
 
 def test_verification_under_friction_that_is_too_fast_for_explicit_steps():
-    """The cost of the controls alone, against SciPy's Radau over each control."""
     rough = problem(2e-4)
     plan = vp.solve(rough, max_iterations=15)
     found = plan.verify(tolerance=1e-5, max_substeps=256)
@@ -113,3 +108,85 @@ def test_an_arm_comes_to_rest():
         np.testing.assert_allclose(motion.q[::50], true, atol=error)
         assert np.abs(motion.v[-1]).max() < 1e-6
         assert np.diff(motion.energy).max() <= 1e-12 * motion.energy[0]
+
+
+CHAIN = vp.planar_chain(2)
+DT, STEPS = 0.01, 100
+ENDS = {"lower": {"joint1": -9.0, "joint2": -9.0}, "upper": {"joint1": 9.0, "joint2": 0.5}}
+
+
+def stopped():
+    stop = vp.JointStop(1e3, 300.0, **ENDS, width=0.05)
+    scene = vp.Scene(CHAIN, gravity=False, damping=0.3, forces=[stop])
+    controls = np.random.default_rng(0).uniform(-6.0, 6.0, (STEPS, 2)) + np.array([0.0, 5.0])
+    return scene, [0.0, 0.0], [0.5, 0.0], controls
+
+
+def test_stops_ahead():
+    scene, q0, v0, controls = stopped()
+    options = {"dt": DT, "steps": STEPS, "controls": controls}
+    usual = vp.simulate(scene, q0, v0, **options)
+    named = vp.simulate(scene, q0, v0, **options, integrator=vp.Gauss(2), check=False)
+    assert (usual.integrator, named.integrator) == ("Radau(stages=4)", "Gauss(stages=2)")
+    assert usual.warnings == ()
+    fine = {"dt": DT / 32, "steps": 32 * STEPS, "controls": np.repeat(controls, 32, axis=0)}
+    true = vp.simulate(scene, q0, v0, **fine, integrator=vp.Radau(3), check=False)
+    q, v = true.q[::32], true.v[::32]
+    assert np.abs(usual.q - q).max() < 1e-3 * np.ptp(q, axis=0).max()
+    assert np.abs(usual.v - v).max() < 3e-3 * np.abs(v).max() < 0.15 * np.abs(named.v - v).max()
+
+
+def test_a_stop_between_two_nodes():
+    stop = vp.JointStop(1e6, 500.0, **ENDS, width=1e-3)
+    scene = vp.Scene(CHAIN, gravity=False, forces=[stop])
+    # The nodes lie 0.005 rad before the stop and behind it.
+    motion = vp.simulate(scene, [0.0, 0.445], [0.0, 5.0], dt=DT, steps=4)
+    assert motion.q[:, 1].max() < 0.5
+    assert motion.integrator == "Radau(stages=4)"
+
+
+def test_a_stiff_stop():
+    scene = vp.Scene(CHAIN, gravity=False, forces=[vp.JointStop(1e4, 0.0, **ENDS)])
+    for speed in (2.0, 0.2):
+        motion = vp.simulate(scene, [0.0, 0.3], [0.0, speed], dt=DT, steps=60, check=False)
+        assert motion.integrator == "Gauss(stages=4)"
+
+
+def test_paths_without_noise_are_those_of_simulate():
+    scene, q0, v0, controls = stopped()
+    options = {"dt": DT, "steps": STEPS, "controls": controls}
+    alone = vp.simulate(scene, q0, v0, **options)
+    paths = vp.simulate_ensemble(scene, q0, v0, **options, paths=2, rng=0)
+    assert paths.integrator == alone.integrator == "Radau(stages=4)"
+    assert paths.integrator in repr(paths)
+    np.testing.assert_array_equal(paths.q[1], alone.q)
+    # Those that start away from the stop, which later ones come to.
+    q0 = np.linspace([0.0, -3.0], [0.0, 0.3], 32)
+    assert vp.simulate_ensemble(scene, q0, [0.0, 3.0], dt=DT, steps=10, paths=32, rng=0).integrator == alone.integrator
+    noisy = vp.Scene(CHAIN, gravity=False, damping=0.3, noise=vp.AdditiveNoise(0.1))
+    assert vp.simulate_ensemble(noisy, q0[:2], [0.0, 0.5], dt=DT, steps=10, paths=2, rng=0).integrator.startswith("Mid")
+
+
+@pytest.mark.parametrize(
+    ("scene", "rng", "chosen"),
+    [
+        ({"damping": 0.3}, None, "Gauss(stages=2)"),
+        ({"damping": [0.3, 200.0]}, None, "Radau(stages=4)"),
+        ({"damping": 0.3, "forces": [vp.JointStop(1e3, 300.0, **ENDS)]}, None, "Radau(stages=4)"),
+        ({"damping": 0.3, "forces": vp.FrameDamper("tip", np.zeros(3), [0, 0, 1e4])}, None, "Gauss(stages=2)"),
+        ({"damping": 0.3, "forces": vp.FrameDamper("tip", np.zeros(3), [1e4, 0, 0])}, None, "Radau(stages=4)"),
+        ({"damping": 0.3, "noise": vp.AdditiveNoise(0.1)}, None, 'Gauss(stages=2, kick="held")'),
+        ({"damping": 0.3, "noise": vp.AdditiveNoise(0.1)}, 0, 'Midpoint(alpha=0.5, kick="held")'),
+    ],
+    ids=["light", "damped", "stops", "no lever", "lever", "no noise", "noise"],
+)
+def test_a_plant_takes_that_of_simulate(scene, rng, chosen):
+    """As its start, its stops and the first plan ask for it, at its own steps."""
+    cost = vp.TrackingCost(lambda t: [1.57 - t, 0.0], 100.0) + vp.ControlCost(1e-3)
+    start = [1.57, 0.0], [0.0, 0.0]
+    problem = vp.OptimalControlProblem(vp.Scene(CHAIN, gravity=False), cost, *start, dt=0.05, steps=10)
+    plant = vp.Plant(vp.Scene(CHAIN, gravity=False, **scene), substeps=5)
+    assert vp.Mpc(problem).run(plant, duration=0.1, rng=rng).motion.integrator == chosen
+    named = replace(plant, integrator=vp.RungeKutta4(), substeps=50)
+    if chosen != "Radau(stages=4)":
+        assert vp.Mpc(problem).run(named, duration=0.1, rng=rng).motion.integrator == "RungeKutta4"

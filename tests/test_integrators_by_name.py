@@ -31,17 +31,14 @@ def test_text_makes_it_again(made):
     assert type(made) is BY_NAME[type(made).__name__]
 
 
-def test_words_without_quotes_are_taken_too():
-    """As on the command line, and in older files of motions."""
-    assert integrator_of("Midpoint(alpha=0.5, kick=held)") == vp.Midpoint(kick="held")
-
-
 def test_every_integrator_is_known_and_has_a_name_in_scene_files():
     own = {kind for kind in vars(vp).values() if isinstance(kind, type) and issubclass(kind, vp.Integrator)}
     assert set(BY_NAME.values()) == own - {vp.Integrator}
     names = ["midpoint", "gauss", "radau", "explicit_euler", "semi_implicit_euler", "runge_kutta_4"]
     assert list(INTEGRATORS) == names
     assert integrator_of(" Gauss(3, kick='split') ") == vp.Gauss(3, kick="split")
+    # Without quotes, as on the command line and in older files of motions.
+    assert integrator_of("Midpoint(alpha=0.5, kick=held)") == vp.Midpoint(kick="held")
 
 
 @pytest.mark.parametrize(

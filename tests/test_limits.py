@@ -39,7 +39,6 @@ def gantry():
 
 
 def test_sliders_on_sliders_keep_their_digits_far_out():
-    """Nothing but V depends on where the sliders stand: the jet a thousand kilometres away is the jet at home."""
     scene = vp.Scene(gantry())
     q, v = np.array([0.0, 0.0, 0.0, 0.7, -0.4]), np.array([0.3, -2.0, 1.0, 3.0, -1.0])
     near = vp.lagrangian_jet(scene, q, v)
@@ -135,7 +134,6 @@ def test_a_light_part_on_a_joint_that_follows_has_a_sound_balance(integrator, ra
 
 @pytest.mark.parametrize("dt", [0.05, 0.1, 0.2])
 def test_a_heavy_wheel_does_not_hide_what_it_carries(dt):
-    """Seen from a wheel that turns as ever, the links keep their energy less that of the centrifugal force."""
     scene, rate = vp.Scene(carousel(2)), 0.5
     assert scene.robot.tree.carried.tolist() == [[0, 1, 1]]
     motion = vp.simulate(scene, np.zeros(3), [rate, 0.0, 0.0], dt=dt, steps=2000)
@@ -150,7 +148,6 @@ def test_a_heavy_wheel_does_not_hide_what_it_carries(dt):
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)], ids=str)
 def test_light_parts_that_slide_and_turn_have_sound_balances(integrator):
-    """Small steps of whatever rides on whatever are accepted whole: the balance of a light part closes."""
     rng, parts = np.random.default_rng(0), 0
     for seed in range(40):
         robot = vp.load_robot(random_tree(seed, 2 + seed % 4, armature=False, ratio=1e-6))
@@ -165,7 +162,6 @@ def test_light_parts_that_slide_and_turn_have_sound_balances(integrator):
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)], ids=str)
 @pytest.mark.parametrize("rate", [1.0, 2.5, 10.0])
 def test_what_dies_out_ends_at_rest(integrator, rate):
-    """Down through every power of ten to where squares underflow."""
     scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=rate * 100.0 / 3.0)
     motion = vp.simulate(scene, [0.0], [100.0], dt=1e-2, steps=2000, integrator=integrator)
     assert abs(motion.v[-1, 0]) < 1e-280

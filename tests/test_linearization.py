@@ -1,5 +1,7 @@
 """Linearizations of steps in parts and under noise against differences, and their moments against sampling."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from oracles import Mechanism, slope
@@ -27,7 +29,6 @@ def friction_noise(n, strength):
 
 
 def test_velocity_dependent_fields():
-    """Their derivatives at fixed momentum enter Gx; the next test has their drift."""
     scene = vp.Scene(vp.load_robot("ur5"), damping=0.1, noise=friction_noise(6, 0.3))
     q, v, u, e, other = np.random.default_rng(0).uniform(-1, 1, (5, 6))
     options = {"dt": 1e-3, "steps": 1, "controls": u, "integrator": vp.Midpoint(), "check": False}
@@ -80,7 +81,6 @@ def test_noisy_motions_are_linearized_at_zero_noise(integrator, custom):
 
 
 def test_moments_against_samples():
-    """Closed-form mean and covariance within 4 standard errors of 5e4 sampled linearizations."""
     noise = vp.AdditiveNoise(3e-6) + vp.StateNoise(2e-4, center=0.0)
     scene = vp.Scene(vp.load_robot("finger"), damping=1e-6, stiffness=5e-6, noise=noise)
     motion = vp.simulate(scene, [0.4, 0.3, 0.2], [0.0, 0.0, 0.0], dt=5e-3, steps=12)
@@ -125,3 +125,164 @@ def test_what_is_no_trajectory_is_refused(motion):
     for call in (lambda: vp.linearize(scene, motion), lambda: vp.second_order(scene, motion, np.zeros(2))):
         with refused(vp.InputError, "motion", "varpin.Trajectory"):
             call()
+
+
+ARMS = {
+    "double_pendulum": (0.1, 8.0, {"damping": 0.02}),
+    "finger": (0.03, 12.0, {"stiffness": 1e-5}),
+    "ur5": (0.15, 4.0, {"damping": 0.1, "stiffness": 1.0}),
+}
+
+
+def velocity(scene, q, p):
+    return np.linalg.solve(vp.lagrangian_jet(scene, q, np.zeros_like(q)).Lvv, p)
+
+
+def parts_of(motion):
+    """The halvings of each step, none for one that was taken whole."""
+    counts = np.where(motion.statistics.substeps > 1, motion.statistics.substeps, 0)
+    return np.split(motion.statistics.halvings, np.cumsum(counts)[:-1])
+
+
+def composed(scene, integrator, dt, halvings, q, p, u):
+    plain = type(integrator)(**{**vars(integrator), "guard": None})
+    for level in halvings:
+        step = vp.simulate(
+            scene, q, velocity(scene, q, p), dt=dt / 2.0**level, steps=1, controls=u, integrator=plain, check=False
+        )
+        q, p = step.q[1], step.p[1]
+    return np.concatenate([q, p])
+
+
+def units_of(scene, q, v):
+    light = 0.5 / np.diag(np.linalg.inv(vp.lagrangian_jet(scene, q, v).Lvv))
+    return np.concatenate([np.ones(len(q)), light, np.abs(scene.actuation.T) @ light])
+
+
+def moving(name, integrator, seed, rng=None, **extras):
+    dt, speed, surroundings = ARMS[name]
+    scene = vp.Scene(vp.load_robot(name), **(surroundings | extras))
+    n, drawn = scene.robot.dof, np.random.default_rng(seed)
+    q, v = drawn.uniform(-1.5, 1.5, n), speed * drawn.normal(size=n)
+    u = 0.1 * drawn.normal(size=(8, n)) * np.abs(vp.lagrangian_jet(scene, q, v).Lq).max()
+    return scene, vp.simulate(scene, q, v, dt=dt, steps=8, controls=u, integrator=integrator, rng=rng, check=False)
+
+
+CASES = [
+    ("double_pendulum", vp.Midpoint(), 0),
+    ("double_pendulum", vp.Midpoint(alpha=0.3), 1),
+    ("double_pendulum", vp.Gauss(2), 1),
+    ("finger", vp.Midpoint(), 1),
+    ("finger", vp.Gauss(2), 1),
+    ("finger", vp.Radau(2), 1),
+    ("ur5", vp.Midpoint(), 0),
+    ("ur5", vp.Gauss(2), 0),
+]
+each_case = pytest.mark.parametrize(("name", "integrator", "seed"), CASES, ids=str)
+
+
+def taken_otherwise(scene, motion, integrator):
+    """Steps in parts, of which a fresh start from their node would take others."""
+    for k, halvings in enumerate(parts_of(motion)):
+        if len(halvings):
+            again = vp.simulate(
+                scene, motion.q[k], motion.v[k], dt=motion.dt, steps=1, controls=motion.u[k], integrator=integrator,
+                check=False,
+            )  # fmt: skip
+            if not np.array_equal(again.statistics.halvings, halvings):
+                yield k
+
+
+@each_case
+def test_parts_are_those_of_the_motion(name, integrator, seed):
+    scene, motion = moving(name, integrator, seed)
+    assert motion.statistics.split_steps > 3
+    parts = parts_of(motion)
+    assert [max(len(halvings), 1) for halvings in parts] == motion.statistics.substeps.tolist()
+    for k, halvings in enumerate(parts):
+        lengths = halvings if len(halvings) else [0]
+        end = composed(scene, integrator, motion.dt, lengths, motion.q[k], motion.p[k], motion.u[k])
+        for found, node in zip(np.split(end, 2), (motion.q[k + 1], motion.p[k + 1]), strict=True):
+            np.testing.assert_allclose(found, node, rtol=0, atol=1e-10 * np.abs(node).max())
+
+
+@each_case
+def test_derivatives_are_those_of_the_parts_taken(name, integrator, seed):
+    """Against differences of plain steps in the same parts, which a fresh start would not have taken."""
+    scene, motion = moving(name, integrator, seed)
+    k = next(taken_otherwise(scene, motion, integrator))
+    lin, n, rng = vp.linearize(scene, motion), scene.robot.dof, np.random.default_rng(0)
+    units = units_of(scene, motion.q[k], motion.v[k])
+    point = np.concatenate([motion.q[k], motion.p[k], motion.u[k]])
+    given = np.hstack([lin.A[k], lin.B[k]]) * units / units[: 2 * n, None]
+
+    def end(y):
+        q, p, u = np.split(y, 3)
+        return composed(scene, integrator, motion.dt, parts_of(motion)[k], q, p, u)
+
+    for block in (slice(0, 2 * n), slice(2 * n, 3 * n)):
+        e = np.zeros(3 * n)
+        e[block] = rng.uniform(-1.0, 1.0, e[block].size)
+        expected = slope(end, point, e * units, 3e-3 / np.abs(given[:, block]).max()) / units[: 2 * n]
+        np.testing.assert_allclose(given @ e, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+    np.testing.assert_array_equal(lin.K[k], lin.A[k][:, n:])
+
+
+@pytest.mark.parametrize(("name", "integrator", "seed"), CASES[::3], ids=str)
+def test_second_derivatives_are_those_of_the_parts_taken(name, integrator, seed):
+    scene, motion = moving(name, integrator, seed)
+    k = next(taken_otherwise(scene, motion, integrator))
+    step, n, rng = motion.part(k, k + 1), scene.robot.dof, np.random.default_rng(seed)
+    units = units_of(scene, step.q[0], step.v[0])
+    z = rng.normal(size=2 * n) / units[: 2 * n]
+    e, other = rng.uniform(-1.0, 1.0, (2, 3 * n)) * units
+    second = vp.second_order(scene, step, z)
+    given = np.block([[second.xx[0], second.ux[0].T], [second.ux[0], second.uu[0]]])
+
+    def gradient(y):
+        q, p = (np.vstack([y[i : i + n], y[i : i + n]]) for i in (0, n))
+        lin = vp.linearize(scene, replace(step, q=q, p=p, u=y[None, 2 * n :]))
+        return z @ np.hstack([lin.A[0], lin.B[0]]) @ other
+
+    A = vp.linearize(scene, step).A[0] * units[: 2 * n] / units[: 2 * n, None]
+    point = np.concatenate([step.q[0], step.p[0], step.u[0]])
+    expected = slope(gradient, point, e, 3e-3 / max(1.0, np.abs(A).max()))
+    assert abs(other @ given @ e - expected) < 1e-7 * np.abs(given * np.outer(units, units)).max()
+
+
+def test_parts_are_kept_however_a_motion_is_made():
+    integrator = vp.Midpoint()
+    scene, motion = moving("finger", integrator, 1)
+    expected = motion.statistics
+    start, options = (motion.q[0], motion.v[0]), {"dt": motion.dt, "steps": motion.steps, "check": False}
+    law = {"controls": lambda t, q, v: motion.u[round(t / motion.dt)], "integrator": integrator}
+    by_law = vp.simulate(scene, *start, **law, **options)
+    np.testing.assert_array_equal(by_law.statistics.halvings, expected.halvings)
+    strict = vp.Midpoint(guard=vp.Guard(max_halvings=2))
+    with pytest.raises(vp.StepFailure) as failure:
+        vp.simulate(scene, *start, controls=motion.u, integrator=strict, **options)
+    before = failure.value.trajectory
+    assert before.steps > 0
+    np.testing.assert_array_equal(before.statistics.halvings, expected.part(0, before.steps).halvings)
+
+
+@pytest.mark.parametrize("kick", ["left", "split"])
+def test_noisy_steps_are_taken_in_parts_without_their_kick(kick):
+    integrator = vp.Midpoint(kick=kick)
+    scene, motion = moving("double_pendulum", integrator, 0, noise=vp.AdditiveNoise(0.05), rng=3)
+    assert motion.dw.any()
+    lin = vp.linearize(scene, motion)
+    checked = 0
+    for k, halvings in enumerate(parts_of(motion)[:4]):
+        units = units_of(scene, motion.q[k], motion.v[k])[:4]
+        e = units * np.random.default_rng(k).uniform(-1.0, 1.0, 4)
+        lengths = halvings if len(halvings) else [0]
+
+        def end(y, k=k, lengths=lengths):
+            return composed(scene, integrator, motion.dt, lengths, y[:2], y[2:], motion.u[k])
+
+        size = 1e-3 / max(1.0, np.abs(lin.A[k] * units / units[:, None]).max())
+        expected = slope(end, np.append(motion.q[k], motion.p[k]), e, size)
+        np.testing.assert_allclose(lin.A[k] @ e, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
+        checked += len(halvings) > 1
+    assert checked > 1

@@ -67,7 +67,8 @@ def test_jury_conditions(kp, kd, period):
     a, b = kp * h**2 / INERTIA, kd * h / INERTIA
     size = np.abs(np.roots([1.0, -(2.0 - b - 0.5 * a), 1.0 - b + 0.5 * a])).max()
     stable = 0.5 * a < b < 2.0
-    motion = run(ROD, [0.3], [0.2 * (kp == 0)], pd(kp, kd), dt=h / period, steps=150 * period, period=period)
+    options = {"dt": h / period, "steps": 150 * period, "period": period}
+    motion = run(ROD, [0.3], [0.2 * (kp == 0)], pd(kp, kd), **options)
     assert bool(told(motion)) != stable, (size, motion.warnings)
     for finding in unstable_loop(ROD, motion):
         assert (finding.kind, finding.joint) == (KIND, "joint1")
@@ -97,7 +98,6 @@ def test_random_loops_of_chains(integrator):
 @pytest.mark.parametrize("compensated", [False, True])
 @pytest.mark.parametrize("limit", [np.inf, 25.0])
 def test_six_joints(share, compensated, limit):
-    """The fastest direction loses a share of its speed a period; limits of torque cut the start off."""
     scene, n, h = vp.Scene(vp.load_robot("ur5"), damping=0.05), 6, 2e-3
     goal = np.array([0.3, -1.0, 1.2, -0.8, 0.5, 0.7])
     jet = vp.lagrangian_jet(scene, goal, np.zeros(n))
@@ -127,7 +127,6 @@ def test_a_law_is_read_off_where_it_does_not_clip():
      (2, 0.029, 850, 19, 5.7, False), (2, 0.013, 1100, 91, 6.5, True)],
 )  # fmt: skip
 def test_an_unstable_loop_that_clips_is_told(n, period, kp, kd, limit, gravity):
-    """It cannot grow beyond its limits, and goes from one to the other, in bursts or for ever."""
     scene = vp.Scene(vp.planar_chain(n), gravity=gravity)
     motion = run(scene, np.zeros(n), np.zeros(n), pd(kp, kd, limit=limit), dt=period / 2, steps=298, period=2)
     assert radius(scene, np.hstack([-kp * np.eye(n), -kd * np.eye(n)]), period, np.ones(n)) > 1.0
@@ -223,7 +222,6 @@ LOOPS = {"four-bar": ((1.3, 0.0, 0.2), [-1.5, 1.5, 1.5], ["joint1"]),
     ],
 )
 def test_closed_loops(name, kp, kd, steps, unstable):
-    """The spring of a sampled law pumps energy in, within constraints as without: the motion itself says whether."""
     place, seed, driven = LOOPS[name]
     joint = vp.PointOnPoint("tip", place, axes="xz")
     scene = vp.Scene(vp.planar_chain(len(seed)), damping=0.05, constraints=joint, actuation=driven)
@@ -240,7 +238,6 @@ def test_closed_loops(name, kp, kd, steps, unstable):
 
 
 def test_policies():
-    """Constant gains beyond their period are told, the gains of a plan for its horizon are not."""
     for kd, unstable in ((50.0, False), (80.0, True)):
         gains, goals = np.tile([[-1e3, -kd]], (100, 1, 1)), np.tile([1.0, 0.0], (100, 1))
         policy = vp.LinearPolicy(np.zeros((100, 1)), gains, goals, on="velocity")

@@ -23,18 +23,11 @@ from varpin.model.chain import rod_chain
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A scene, a state to start from, and controls that suit it.
+    """A scene, a state to start from, and controls that suit it: waves of ``amp`` about ``base``, one number or (m,).
 
-    Attributes:
-        name: Its key in ``ZOO``.
-        build: Makes the scene.
-        q: Where it starts: one number, (n,), or a guess that a loop is assembled from [rad or m].
-        v: How fast it starts, the part along the constraints [rad/s or m/s].
-        dt: A step that resolves the motion [s].
-        amp: Amplitude of controls, one number or (m,).
-        base: Mean of controls, one number or (m,).
-        stiff: Whether the oracle is to be implicit.
-        path: Position, rate and acceleration of prescribed joints at a time.
+    ``q`` is one number, (n,), or a guess that a loop is assembled from [rad or m]; of ``v`` the part along the
+    constraints counts [rad/s or m/s]. ``dt`` resolves the motion [s]. The oracle is implicit if it is ``stiff``.
+    ``path`` has position, rate and acceleration of prescribed joints at a time.
     """
 
     name: str

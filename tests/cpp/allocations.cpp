@@ -178,7 +178,8 @@ bool allocates_nothing(const varpin::Mechanism& mechanism) {
 // A chain whose tip slides along a line, from rest.
 bool constrained_steps_allocate_nothing() {
     varpin::Mechanism mechanism = arm();
-    const varpin::Anchor tip{n - 1, 2.0 * mechanism.tree.bodies[n - 1].center}, across{-1, {0.0, 0.0, 1.0}, true};
+    const varpin::Anchor tip{n - 1, 2.0 * mechanism.tree.bodies[n - 1].center};
+    const varpin::Anchor across{-1, {0.0, 0.0, 1.0}, true};
     const double q0[n] = {0.4, 0.3, -0.5}, v0[n] = {}, h = 0.001;
     const double height = -std::sin(0.4) - std::sin(0.7) - std::sin(0.2);
     mechanism.constraints = {
