@@ -263,6 +263,13 @@ def test_a_broken_open_loop_ends_an_ensemble():
     assert info.value.trajectory is None
 
 
+@pytest.mark.parametrize("state", [{"q0": [1e308, 0.0]}, {"v0": [1e200, 0.0]}, {"v0": [1e160, -1e160]}])
+def test_numbers_beyond_reason_fail_and_say_where(state):
+    with refused(vp.StepFailure, "step 0", "t = 0 s", "dt") as info:
+        motion(**state)
+    assert info.value.trajectory.steps == 0
+
+
 @pytest.mark.parametrize("field", Diffusion._fields)
 @pytest.mark.parametrize("value", [np.zeros((1, 1)), np.zeros((9, 9)), None, np.full((2, 2), np.inf, dtype="f4")])
 def test_noise_of_one_s_own(field, value):

@@ -18,21 +18,19 @@ PLACES = [None, PLACE, PLACE.inverse()]
 
 
 def forest():
-    """The chains beside each other, and the coordinates of each."""
-    together = vp.combine(*CHAINS, placements=PLACES, prefixes=["a_", "b_", "c_"])
-    return together, [np.arange(0, 3), np.arange(3, 4), np.arange(4, 8)]
+    return vp.combine(*CHAINS, placements=PLACES, prefixes=["a_", "b_", "c_"])
 
 
-def between(parts):
-    """Which entries of a matrix (n, n) are of two parts."""
-    part = np.repeat(np.arange(len(parts)), [own.size for own in parts])
-    return part[:, None] != part
+def between(robot):
+    """Which entries of a matrix (n, n) are of two groups."""
+    return robot.tree.group[:, None] != robot.tree.group
 
 
 @over_integrators
 def test_together_as_each_alone(integrator):
-    together, parts = forest()
+    together = forest()
     assert together.tree.ends.tolist() == [3, 4, 8]
+    assert together.tree.group.tolist() == [0, 0, 0, 1, 2, 2, 2, 2]
     own_terms = {"damping": 0.05 + 0.01 * np.arange(8), "stiffness": 0.5 * np.arange(8), "rest": 0.1 * np.arange(8)}
     noise, gravity = vp.AdditiveNoise(0.02), np.array([0.0, 1.0, -9.0])
     scene = vp.Scene(together, gravity=gravity, noise=noise, **own_terms)
@@ -47,7 +45,7 @@ def test_together_as_each_alone(integrator):
     curved = isinstance(integrator, vp.Midpoint | vp.Gauss)
     z = rng.normal(size=16)
     xx = vp.second_order(scene, motion, z).xx if curved else np.zeros((1, 16, 16))
-    for chain, place, own in zip(CHAINS, PLACES, parts, strict=True):
+    for chain, place, own in zip(CHAINS, PLACES, np.split(np.arange(8), [3, 4]), strict=True):
         turned = gravity if place is None else place.rotation.T @ gravity
         alone = vp.Scene(chain, gravity=turned, noise=noise, **{name: value[own] for name, value in own_terms.items()})
         given = {"controls": motion.u[:, own], "increments": dw[:, own], "integrator": integrator, **STEPS}
@@ -63,7 +61,7 @@ def test_together_as_each_alone(integrator):
             np.testing.assert_allclose(xx[:, both[:, None], both], there, rtol=0, atol=1e-9)
     # Between chains there is nothing, to the last bit.
     for matrix in (lin.A, lin.B, xx):
-        assert not matrix[:, np.tile(between(parts), (2, matrix.shape[2] // 8))].any()
+        assert not matrix[:, np.tile(between(together), (2, matrix.shape[2] // 8))].any()
 
 
 @over_integrators
@@ -86,18 +84,16 @@ def test_a_branch_between_two_that_a_mimic_joint_ties(tmp_path, integrator):
     A = vp.linearize(whole, motion).A
     both = np.array([*own, *(5 + i for i in own)])
     np.testing.assert_allclose(A[:, both[:, None], both], vp.linearize(without, apart).A, rtol=0, atol=1e-9)
-    group = whole.robot.tree.group
-    assert not A[:, np.tile(group[:, None] != group, (2, 2))].any()
+    assert not A[:, np.tile(between(whole.robot), (2, 2))].any()
 
 
 def test_in_halves():
     """Steps that the guards split, with their derivatives chained."""
-    together, parts = forest()
-    scene, (q, v) = vp.Scene(together), np.random.default_rng(0).uniform(-1.0, 1.0, (2, 8))
+    scene, (q, v) = vp.Scene(forest()), np.random.default_rng(0).uniform(-1.0, 1.0, (2, 8))
     motion = vp.simulate(scene, q, 4.0 * v, dt=0.1, steps=10, integrator=vp.Midpoint())
     assert motion.statistics.split_steps > 3
     lin = vp.linearize(scene, motion)
-    assert not lin.A[:, np.tile(between(parts), (2, 2))].any()
+    assert not lin.A[:, np.tile(between(scene.robot), (2, 2))].any()
     J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(8))
     for A in lin.A:
         np.testing.assert_allclose(A.T @ J @ A, J, rtol=0, atol=1e-9 * np.abs(A).max() ** 2)

@@ -130,16 +130,6 @@ def test_bad_files(urdf, caplog, kind):
     assert not unnamed(caplog.text, facts)
 
 
-def test_xacro_file(urdf, tmp_path):
-    pytest.importorskip("xacro")
-    path = tmp_path / "any.srdf.xacro"
-    path.write_text(
-        '<robot name="made_up" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arg name="at" default="0.5"/>'
-        '<group_state name="home"><joint name="j1" value="${2 * 0.3}"/></group_state></robot>'
-    )
-    assert vp.load_robot(urdf, srdf=path).posture("home")[0] == 0.6
-
-
 def test_reference_configurations_of_a_model(urdf):
     model = pin.buildModelFromUrdf(str(urdf))
     q = pin.randomConfiguration(model, -np.ones(model.nq), np.ones(model.nq))

@@ -148,23 +148,27 @@ def test_the_description_s_dampers_take_what_pinocchio_s_model_says(rubbing, cap
     np.testing.assert_array_equal(*ends)
 
 
-def loaded(folder, damping, base):
+def loaded(folder, head, base):
     path = folder / "scene.toml"
     robot = f'[robot]\nsource = "xarm7"\nbase = {base}\narmature = {{ joint3 = 0.4 }}'
-    path.write_text(f"damping = {damping}\n{robot}\n[horizon]\ndt = 1e-3\nsteps = 3\n")
+    path.write_text(f"{head}\n{robot}\n[horizon]\ndt = 1e-3\nsteps = 3\n")
     return vp.load_scene(path, required_only=False).scene
 
 
-def test_scene_files_take_them(tmp_path):
-    scene = loaded(tmp_path, '"robot"', '"planar"')
+def test_scene_files_take_them(tmp_path, caplog):
+    own = [10.0, 10.0, 5.0, 5.0, 5.0, 2.0, 2.0]
+    # The robot's file gives dry friction, too, which is told of wherever the rest is taken.
+    for head, damping, told in (("", [0.0] * 7, 2), ('damping = "robot"', own, 1), ("damping = 0.0", [0.0] * 7, 0)):
+        caplog.clear()
+        scene = loaded(tmp_path, head, '"planar"')
+        assert (scene.damping[3:].tolist(), len(left_out(caplog))) == (damping, told)
     assert scene.robot.joint_names[:3] == ("base_x", "base_y", "base_turn")
-    assert scene.damping.tolist() == [0.0] * 3 + [10.0, 10.0, 5.0, 5.0, 5.0, 2.0, 2.0]
-    robot = loaded(tmp_path, "0.0", "{ xyz = [0.0, 0.0, 2.0], rpy = [0.0, 0.5, 0.3] }").robot
+    robot = loaded(tmp_path, "", "{ xyz = [0.0, 0.0, 2.0], rpy = [0.0, 0.5, 0.3] }").robot
     assert robot.tree.armature[robot.joint_names.index("joint3")] == 0.4
     place = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.5, 0.3), np.array([0.0, 0.0, 2.0]))
     other, q = vp.load_robot("xarm7", base=place), np.zeros(7)
     np.testing.assert_allclose(robot.frame_positions(q), other.frame_positions(q), atol=1e-12)
     with refused(vp.SceneFileError, "robot.base"):
-        loaded(tmp_path, "0.0", '"round"')
+        loaded(tmp_path, "", '"round"')
     with refused(vp.SceneFileError, "'urdf'", "robot"):
-        loaded(tmp_path, '"urdf"', '"planar"')
+        loaded(tmp_path, 'damping = "urdf"', '"planar"')

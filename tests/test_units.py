@@ -89,6 +89,18 @@ def test_limits_that_are_passed_are_told_and_counted(kind, sides, q, v, pull, ki
     assert ("warning" in repr(motion)) == bool(kinds)
 
 
+@pytest.mark.parametrize(("end", "words"), [(None, "nothing stops it"), (0.9, "nothing stops it"), (0.5, "gives way")])
+def test_a_passed_limit_is_that_of_the_robot(end, words):
+    """Also beside a stop, which gives way: the depth is counted from the description's limit."""
+    forces = [] if end is None else vp.JointStop(20.0, 1.0, lower=-2.0, upper=end)
+    scene = vp.Scene(arm(TURN, lower=-2.0, upper=0.5), gravity=False, forces=forces)
+    motion = vp.simulate(scene, [0.0], [2.0], dt=1e-3, steps=1000)
+    (told,) = about(motion.warnings, "position limits")
+    depth = motion.q.max() - 0.5
+    assert not unnamed(told, "0.5 rad", f"by {depth:.3g} at", words)
+    assert told.value == pytest.approx(depth, rel=1e-12)
+
+
 def test_forces_beyond_effort_limits_are_told_of_by_what_reaches_the_joint():
     # One control pulls at both joints: a gear of 3 and one of -1/2.
     scene = vp.Scene(arm(SLIDE, TURN), gravity=False, actuation=[[3.0], [-0.5]])
@@ -141,21 +153,12 @@ def test_positions_for_servos_in_degrees(scene):
     assert len(naming(moved(servos, HOME), "degrees")) == 1
 
 
-@pytest.mark.parametrize(
-    ("kind", "q", "told"),
-    [
-        (WHEEL, 90.0, True),
-        (WHEEL, -22.5, True),
-        (WHEEL, 12.5, False),
-        (WHEEL, 33.3333333, False),
-        (WHEEL, 1e3 / 7.0, False),
-        (SLIDE, 90.0, False),
-    ],
-)
-def test_joints_without_limits_may_have_turned_many_times(kind, q, told):
+@pytest.mark.parametrize(("q", "told"), [(90.0, 1), (-22.5, 1), (12.5, 0), (33.3333333, 0), (1e3 / 7.0, 0)])
+def test_joints_without_limits_may_have_turned_many_times(q, told):
     """A wheel that has turned is no mistake; a number of one decimal is typed."""
-    wheel = vp.Scene(arm(kind, lower=-np.inf, upper=np.inf), gravity=False)
-    assert bool(naming(moved(wheel, [q], [0.0]), "degrees")) == told
+    wheel, slide = (vp.Scene(arm(kind, lower=-np.inf, upper=np.inf), gravity=False) for kind in (WHEEL, SLIDE))
+    assert len(naming(moved(wheel, [q], [0.0]), "degrees")) == told
+    assert not naming(moved(slide, [q], [0.0]), "degrees")
 
 
 def test_other_positions_in_degrees(scene, caplog):

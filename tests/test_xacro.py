@@ -131,15 +131,16 @@ def test_arguments_of_what_is_no_xacro_file(tmp_path):
 
 def test_a_robot_of_robot_descriptions(tmp_path, described):
     """With the posture of its SRDF, and a mesh in a package of its repository."""
+    pytest.importorskip("xacro")
     folder = tmp_path / "cache" / "repository" / "parts"
     folder.mkdir(parents=True)
     (folder / "ball.obj").write_text(TRIANGLE)
-    urdf, srdf = arm(tmp_path), tmp_path / "any.srdf"
+    urdf, srdf = arm(tmp_path), tmp_path / "any.srdf.xacro"
     urdf.write_text(urdf.read_text().replace("</link>", f"{BALL}</link>"))
-    srdf.write_text('<robot name="a"><group_state name="home"><joint name="j1" value="0.5"/></group_state></robot>')
+    srdf.write_text(f'{HEAD}<group_state name="home"><joint name="j1" value="${{0.25 * 2}}"/></group_state></robot>')
     described(URDF_PATH=urdf, SRDF_PATH=srdf, REPOSITORY_PATH=folder.parent)
     robot = vp.load_robot("one_description")
-    assert (robot.name, robot.urdf, robot.postures) == ("one_description", urdf, ("home",))
+    assert (robot.name, robot.urdf, robot.posture("home")) == ("one_description", urdf, [0.5])
     assert_is(robot, urdf)
     described("biped", URDF_PATH=urdf)
     with refused(vp.RobotError, "'one_description'", "made_up.urdf"):
