@@ -218,7 +218,7 @@ def test_reach_bounds_where_a_frame_gets(name):
 def test_references_of_rows_go_with_constraints():
     reference = np.linspace(0.0, 1.0, 13)[:, None] * np.array([1.0, 0.5])
     plan = vp.solve(reach(speeds(1.8), more=vp.TrackingCost(reference, 10.0)))
-    assert plan.status is vp.Status.CONVERGED, plan.reason
+    assert plan.status.converged, plan.reason
     assert plan.violation <= 1e-6
 
 
