@@ -7,6 +7,7 @@ from decimal import Decimal, localcontext
 import numpy as np
 import pytest
 from findings import about
+from numpy.testing import assert_allclose
 from refusals import refused
 
 import varpin as vp
@@ -103,7 +104,7 @@ def close(ours, theirs, digits):
     for name, right in theirs.items():
         if right.size:
             scale = np.abs(right).max()
-            np.testing.assert_allclose(ours[name], right, rtol=0, atol=10.0**-digits * scale, err_msg=name)
+            assert_allclose(ours[name], right, rtol=0, atol=10.0**-digits * scale, err_msg=name)
 
 
 def terminal(x):
@@ -123,7 +124,7 @@ def test_a_pass_is_the_equations(roots, dof, m, hold, k, regularization):
     failed, ours, run = run_over(given, *ends, roots=roots, hold=hold, regularization=regularization)
     assert failed == -1
     close(ours, right, 9 if roots else 10)
-    np.testing.assert_allclose((run.slope, run.curvature, run.noise), sums, rtol=1e-9 if roots else 1e-10)
+    assert_allclose((run.slope, run.curvature, run.noise), sums, rtol=1e-9 if roots else 1e-10)
 
 
 def test_two_blocks_are_one_pass():
@@ -137,7 +138,7 @@ def test_two_blocks_are_one_pass():
         }
         assert run.run(H, 2, 0.0, **part, **views) == -1
     close(ours, right, 10)
-    np.testing.assert_allclose((run.slope, run.curvature, run.noise), sums, rtol=1e-10)
+    assert_allclose((run.slope, run.curvature, run.noise), sums, rtol=1e-10)
 
 
 @pytest.mark.parametrize("hold", [1, 3])
@@ -158,9 +159,9 @@ def test_the_linearized_motion_under_gains_is_the_sum_of_its_steps(hold, limited
         if s % hold == 0:
             u = gains["feedforward"][r] + gains["feedback"][r] @ x
             u = np.clip(u, *slack[r]) if limited else u
-            np.testing.assert_allclose(moves[r], u, rtol=1e-12)
+            assert_allclose(moves[r], u, rtol=1e-12)
         x = A[s] @ x + B[s] @ u
-        np.testing.assert_allclose(after[s], x, rtol=1e-12)
+        assert_allclose(after[s], x, rtol=1e-12)
     with refused(ValueError, ("after", "5", "6")):
         core.foresee(hold, A, B, *plan, moves, after[:5])
     with refused(ValueError, "hold"):
@@ -298,7 +299,7 @@ def test_an_optimum_at_extreme_weights_is_found_at_once():
     cost = vp.ControlCost(1e-9) + vp.Terminal(vp.TrackingCost([1e-3, -1e-3], 1e9) + vp.VelocityCost(1e7))
     problem = vp.OptimalControlProblem(scene, cost, np.zeros(2), np.zeros(2), dt=0.01, steps=40)
     sol = vp.solve(problem)
-    assert sol.status is vp.Status.CONVERGED, sol.reason
+    assert sol.status.converged, sol.reason
     assert np.abs(sol.trajectory.q[-1] - [1e-3, -1e-3]).max() < 1e-9
 
 

@@ -33,7 +33,7 @@ def speeds(problem, u, parts):
 def test_speeds_hold_between_nodes_at_least_cost(controls, close):
     problem = reach(controls=controls)
     plan = vp.solve(problem)
-    assert plan.status is vp.Status.CONVERGED, plan.reason
+    assert plan.status.converged, plan.reason
     assert plan.violation <= 1e-6
     assert not about(plan.warnings, "constraints between nodes")
     assert speeds(problem, plan.controls, 32).max() <= LIMIT + 2e-6

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from oracles import rollout
 from plan_problems import linear, sliders
 
@@ -36,7 +37,7 @@ def test_value(weight, before, hold):
     parts = linear(2.0 * (half + 0.0 * vp.VelocityCost()) + 0.5 * vp.ControlRateCost(weight, before), hold=hold)
     assert parts.cost_of(motion) == pytest.approx(rated.cost_of(motion), rel=1e-12)
     many = [np.repeat(array[None], 3, axis=0) for array in (motion.q, motion.v, motion.u)]
-    np.testing.assert_allclose(rated.costs(*many), rated.cost_of(motion), rtol=1e-12)
+    assert_allclose(rated.costs(*many), rated.cost_of(motion), rtol=1e-12)
 
 
 def random_policy(scene, steps, hold=1, before=None, limits=None):
@@ -69,8 +70,8 @@ def test_policies_feed_the_control_before_back(monkeypatch, integrator, limits, 
         if last is not None:
             u = u + policy.previous_gains[k] @ (last - policy.previous[k])
         u = np.clip(u, -0.8, 0.8) if limits else u
-        np.testing.assert_allclose(motion.u[2 * k : 2 * k + 2], [u, u], rtol=0, atol=1e-12)
-        np.testing.assert_array_equal(policy.control(k, x[2 * k], last), u)
+        assert_allclose(motion.u[2 * k : 2 * k + 2], [u, u], rtol=0, atol=1e-12)
+        assert_array_equal(policy.control(k, x[2 * k], last), u)
         last = motion.u[2 * k]
 
 
@@ -103,9 +104,9 @@ def test_feedback_on_another_start_and_another_control_before():
         previous=own.previous[rows], before=own.before,
     )  # fmt: skip
     best = vp.solve(later, tolerance=1e-15)
-    np.testing.assert_allclose(later.simulate(policy).u[::2], best.controls, rtol=0, atol=1e-6)
+    assert_allclose(later.simulate(policy).u[::2], best.controls, rtol=0, atol=1e-6)
     # What is repeated at the end expects itself before, so that it goes on where nothing is off.
-    np.testing.assert_array_equal(own.previous[9:], own.u[8:-1])
+    assert_array_equal(own.previous[9:], own.u[8:-1])
 
 
 def test_mpc_joins_its_plans():
@@ -116,9 +117,9 @@ def test_mpc_joins_its_plans():
         run = vp.Mpc(problem).run(vp.Plant(noisy), duration=1.0, rng=1)
         given = [plan.problem.rate.before for plan in run.plans]
         assert given[0] is None if before is None else (given[0] == before).all()
-        np.testing.assert_array_equal(given[1:], run.motion.u[::10][: len(given) - 1])
+        assert_array_equal(given[1:], run.motion.u[::10][: len(given) - 1])
     again = vp.Mpc(problem).plan(0.1, [0.1, 0.1], [0.0, 0.0], run.plans[0], decisions=2)
-    np.testing.assert_array_equal(again.problem.rate.before, run.plans[0].controls[1])
+    assert_array_equal(again.problem.rate.before, run.plans[0].controls[1])
 
 
 def test_sums_scales_and_words():
@@ -126,5 +127,5 @@ def test_sums_scales_and_words():
     assert own.of_controls
     assert repr(0.5 * own + vp.ControlCost()) == "0.5 * ControlRateCost(weight=2.0) + ControlCost(weight=1.0)"
     assert repr(vp.ControlRateCost([1.0, 2.0], 0.5)) == "ControlRateCost(weight=[1.0, 2.0], before=0.5)"
-    np.testing.assert_array_equal(linear(vp.ControlRateCost(1.0, 0.5)).rate.before, [0.5, 0.5])
-    np.testing.assert_array_equal(linear(2.0 * own + vp.ControlRateCost([1.0, 3.0])).rate.weight, np.diag([5.0, 7.0]))
+    assert_array_equal(linear(vp.ControlRateCost(1.0, 0.5)).rate.before, [0.5, 0.5])
+    assert_array_equal(linear(2.0 * own + vp.ControlRateCost([1.0, 3.0])).rate.weight, np.diag([5.0, 7.0]))

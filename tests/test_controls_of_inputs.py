@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from oracles import exact, lines, slope
 from plan_problems import hand
 
@@ -50,7 +51,7 @@ def test_a_motion_under_a_function_of_time_is_linearized():
 
     for c, size in enumerate((1e-4, 1e-2, 1e-2)):
         found = slope(end, begin, np.eye(3)[c], size)
-        np.testing.assert_allclose(lin.B[0, :, c], found, atol=1e-8 * np.abs(lin.B[0]).max())
+        assert_allclose(lin.B[0, :, c], found, atol=1e-8 * np.abs(lin.B[0]).max())
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
@@ -60,7 +61,7 @@ def test_a_tolerance_divides_lines_as_the_input_moves(interpolation):
     coarse = vp.FirstOrderHold(nodes)
     found = vp.simulate(scene, Q0, V0, duration=SPAN, tolerance=1e-7, controls=coarse)
     fine = vp.simulate(scene, Q0, V0, dt=SPAN / 8, steps=8, controls=coarse, integrator=vp.Gauss(6), check=False)
-    np.testing.assert_allclose(found.q[-1], fine.q[-1], atol=1e-6)
+    assert_allclose(found.q[-1], fine.q[-1], atol=1e-6)
 
 
 def test_a_tolerance_follows_a_function_of_time():
@@ -90,25 +91,25 @@ def test_a_policy_moves_an_input_over_its_intervals(hold, linear):
     motion = vp.simulate(scene, Q0, V0, controls=policy, **given)
     at = np.arange(0, N * hold, hold)
     goals = u[1:, 0] + 0.05 * (motion.q[at, 1] - Q0[1])
-    np.testing.assert_allclose(motion.q[at + hold, 0], goals, atol=1e-13)
-    np.testing.assert_allclose(motion.u[:, 0], motion.q[1:, 0], atol=1e-13)
+    assert_allclose(motion.q[at + hold, 0], goals, atol=1e-13)
+    assert_allclose(motion.u[:, 0], motion.q[1:, 0], atol=1e-13)
     evenly = np.diff(motion.q[:, 0]).reshape(N, hold)
-    np.testing.assert_allclose(evenly, np.broadcast_to(evenly[:, :1], evenly.shape), atol=1e-13)
+    assert_allclose(evenly, np.broadcast_to(evenly[:, :1], evenly.shape), atol=1e-13)
     if not linear:
         again = vp.simulate(scene, Q0, V0, controls=motion.u, **given)
-        np.testing.assert_allclose(again.q, motion.q, atol=1e-12)
+        assert_allclose(again.q, motion.q, atol=1e-12)
         paths = vp.simulate_ensemble(scene, Q0, V0, paths=2, rng=0, controls=policy, **given)
-        np.testing.assert_allclose(paths.q[0], motion.q, atol=1e-13)
-        np.testing.assert_allclose(paths.u[0], motion.u, atol=1e-13)
-    np.testing.assert_allclose(vp.linearize(scene, motion).B[:, 0, 0], 1.0, atol=1e-12)
+        assert_allclose(paths.q[0], motion.q, atol=1e-13)
+        assert_allclose(paths.u[0], motion.u, atol=1e-13)
+    assert_allclose(vp.linearize(scene, motion).B[:, 0, 0], 1.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
 def test_a_controller_takes_them(interpolation):
     problem = hand(interpolation, steps=12, dt=0.04)
     run = vp.Mpc(problem).run(vp.Plant(problem.scene, substeps=3), duration=1.2)
-    np.testing.assert_allclose(run.motion.q[1:, 0], run.motion.u[:, 0], atol=1e-12)
-    np.testing.assert_allclose(run.motion.q[-1], [0.4, -0.6, 0.2], atol=0.1)
+    assert_allclose(run.motion.q[1:, 0], run.motion.u[:, 0], atol=1e-12)
+    assert_allclose(run.motion.q[-1], [0.4, -0.6, 0.2], atol=0.1)
 
 
 @pytest.mark.parametrize("controls", ["held", "linear"])
@@ -121,10 +122,10 @@ def test_searches_start_on_states(interpolation, controls):
     found = vp.solve(problem, states=states, tolerance=1e-12, check=False)
     assert found.status.converged
     assert found.cost == pytest.approx(own.cost, rel=1e-9)
-    np.testing.assert_allclose(found.trajectory.q, own.trajectory.q, atol=1e-5)
+    assert_allclose(found.trajectory.q, own.trajectory.q, atol=1e-5)
     # The first motion of no iterations is on the states.
     first = vp.solve(problem, states=own.trajectory, max_iterations=0, check=False)
-    np.testing.assert_allclose(first.trajectory.q[:, 0], own.trajectory.q[:, 0], atol=1e-12)
+    assert_allclose(first.trajectory.q[:, 0], own.trajectory.q[:, 0], atol=1e-12)
 
 
 def test_noise_of_the_position_of_an_input_is_differentiated_at_the_end_of_the_step():
@@ -142,9 +143,9 @@ def test_noise_of_the_position_of_an_input_is_differentiated_at_the_end_of_the_s
 
     lin = linearized(u)
     first = lin.F[0, :, 0]
-    np.testing.assert_allclose(first, [0.0, u[3] * 0.5 * (u[1] + u[4]), u[3] ** 2], atol=1e-12)
+    assert_allclose(first, [0.0, u[3] * 0.5 * (u[1] + u[4]), u[3] ** 2], atol=1e-12)
     slope = np.array([0.0, u[3] * (u[4] - u[1]), 0.0]) / np.sqrt(12.0)
-    np.testing.assert_allclose(lin.G[0], lin.J[0] @ np.stack([first, slope], axis=1), atol=1e-12)
+    assert_allclose(lin.G[0], lin.J[0] @ np.stack([first, slope], axis=1), atol=1e-12)
     for c in range(6):
         away = step * np.eye(6)[c]
         # The Jacobian of the step stays: it is the fields that are differentiated.
@@ -154,4 +155,4 @@ def test_noise_of_the_position_of_an_input_is_differentiated_at_the_end_of_the_s
             fields.append(np.array([[0.0, last * mean, last**2], [0.0, last * (at[4] - at[1]) / np.sqrt(12.0), 0.0]]).T)
         expected = lin.J[0] @ (fields[0] - fields[1]) / (2.0 * step)
         found = (lin.Gramp if c >= 3 else lin.Gu - lin.Gramp)[0, :, :, c % 3]
-        np.testing.assert_allclose(found, expected, atol=1e-8)
+        assert_allclose(found, expected, atol=1e-8)

@@ -6,6 +6,7 @@ import mechanisms
 import numpy as np
 import pinocchio as pin
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from oracles import Mechanism, placements, slope
 from plan_problems import linear, small
 from refusals import refused
@@ -122,10 +123,10 @@ def test_every_term_is_what_it_is_in_numpy(rng, robot, frame):
     for cost, (value, gradient, hessian) in terms(rng, robot, frame, *at):
         bound = cost.bind(points(robot))
         own = bound.expand(*at)
-        np.testing.assert_allclose(bound.value(*at), value, rtol=1e-12, err_msg=repr(cost))
-        np.testing.assert_allclose(own.gradient, gradient, rtol=1e-11, atol=1e-11 * np.abs(gradient).max())
+        assert_allclose(bound.value(*at), value, rtol=1e-12, err_msg=repr(cost))
+        assert_allclose(own.gradient, gradient, rtol=1e-11, atol=1e-11 * np.abs(gradient).max())
         full = np.broadcast_to(own.hessian, hessian.shape)
-        np.testing.assert_allclose(full, hessian, rtol=1e-11, atol=1e-11 * np.abs(hessian).max())
+        assert_allclose(full, hessian, rtol=1e-11, atol=1e-11 * np.abs(hessian).max())
 
 
 def test_sums_scale_and_add_up(rng, robot, frame):
@@ -145,11 +146,11 @@ def test_sums_scale_and_add_up(rng, robot, frame):
     expected[0] = expected[0] + at[2][:, 0] ** 2
     expected[1] += 2.0 * at[2][:, :1] * unit
     expected[2] += 2.0 * np.diag(unit)
-    np.testing.assert_allclose(bound.value(*at), expected[0], rtol=1e-12)
-    np.testing.assert_allclose(expansion.gradient, expected[1], rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(expansion.hessian, expected[2], rtol=1e-10, atol=1e-10)
+    assert_allclose(bound.value(*at), expected[0], rtol=1e-12)
+    assert_allclose(expansion.gradient, expected[1], rtol=1e-10, atol=1e-10)
+    assert_allclose(expansion.hessian, expected[2], rtol=1e-10, atol=1e-10)
     many = [np.stack([x, x[::-1]]) for x in at]
-    np.testing.assert_allclose(bound.value(*many)[0], expected[0], rtol=1e-12)
+    assert_allclose(bound.value(*many)[0], expected[0], rtol=1e-12)
 
 
 def test_manipulability_where_there_is_none(load):
@@ -162,10 +163,10 @@ def test_manipulability_where_there_is_none(load):
     given = bound.expand(q, q, q)
     slopes = slopes_in_q(lambda q: np.linalg.det(frame.jacobians(q)[2]), q)
     assert (np.abs(slopes[:2]).max(axis=1) > 1e-3).all()
-    np.testing.assert_allclose(np.abs(given.gradient[:, :6]), 0.1 * np.abs(slopes), atol=1e-10)
-    np.testing.assert_allclose(given.gradient[2], 0.0, atol=1e-10)
+    assert_allclose(np.abs(given.gradient[:, :6]), 0.1 * np.abs(slopes), atol=1e-10)
+    assert_allclose(given.gradient[2], 0.0, atol=1e-10)
     outer = slopes[:, :, None] * slopes[:, None, :]
-    np.testing.assert_allclose(given.hessian[:, :6, :6], 2.0 * outer, atol=1e-9)
+    assert_allclose(given.hessian[:, :6, :6], 2.0 * outer, atol=1e-9)
 
 
 def tree(seed):
@@ -188,9 +189,9 @@ def test_frames(load, rng, name):
     for k in range(N):
         own.place(q[k], v[k])
         for found, expected in zip((p[k], R[k], J[k]), own.point(frame), strict=False):
-            np.testing.assert_allclose(found, expected, atol=1e-13)
+            assert_allclose(found, expected, atol=1e-13)
     for placed, once_more in zip(kinematics.placements(q), (R, p), strict=True):
-        np.testing.assert_array_equal(placed, once_more)
+        assert_array_equal(placed, once_more)
 
 
 def turn(axis, angle):
@@ -210,9 +211,9 @@ def test_orientation_at_every_distance(load, angle, axis):
     assert bound.value(q, v, u)[0] == pytest.approx(angle**2 * (axis**2 @ [1, 2, 3]), rel=1e-6, abs=1e-28)
     given = bound.expand(q, v, u)
     J = pin.Jlog3(turn(axis, angle)) @ R.T @ frame_kinematics(robot, "tool0").jacobians(q)[2][0, 3:]
-    np.testing.assert_allclose(given.gradient[0, :6], 2 * angle * J.T @ W @ axis, atol=1e-9 * max(angle, 1e-6))
+    assert_allclose(given.gradient[0, :6], 2 * angle * J.T @ W @ axis, atol=1e-9 * max(angle, 1e-6))
     hessian = 2 * J.T @ W @ J
-    np.testing.assert_allclose(given.hessian[0, :6, :6], hessian, atol=1e-8 * np.abs(hessian).max())
+    assert_allclose(given.hessian[0, :6, :6], hessian, atol=1e-8 * np.abs(hessian).max())
 
 
 def test_targets_in_time(load, rng):
@@ -232,7 +233,7 @@ def test_targets_in_time(load, rng):
     for kind, target, expected in ((vp.FramePositionCost, path, away), (vp.FrameOrientationCost, turning, turned)):
         for given in (target, np.array([target(time) for time in nodes])):
             bound = kind(robot, "tool0", given).bind(Points(t, 1.0, steps, 6, 6))
-            np.testing.assert_allclose(bound.value(q, v, np.zeros((steps, 6))), expected, rtol=1e-10)
+            assert_allclose(bound.value(q, v, np.zeros((steps, 6))), expected, rtol=1e-10)
 
 
 @pytest.mark.parametrize(("steps", "dt"), [(7, 0.1), (300, 1e-3), (99, 1 / 3)])
@@ -242,12 +243,12 @@ def test_references_in_rows(steps, dt):
     for place in (0.0, 0.5 - np.sqrt(3.0) / 6.0, 0.5, 0.5 + np.sqrt(3.0) / 6.0):
         at = Points((np.arange(steps) + place) * dt, dt * steps, steps, 3, 2)
         value = vp.ControlCost(1.0, rows).bind(at).value(zero, zero, zero[:, :2])
-        np.testing.assert_allclose(value, 2 * rows[:, 0] ** 2, rtol=1e-15)
+        assert_allclose(value, 2 * rows[:, 0] ** 2, rtol=1e-15)
     value = vp.ControlCost(1.0, nodes).bind(at).value(zero, zero, zero[:, :2])
-    np.testing.assert_allclose(value, 2 * (np.arange(steps) + place) ** 2, rtol=1e-9)
+    assert_allclose(value, 2 * (np.arange(steps) + place) ** 2, rtol=1e-9)
     last = Points(np.array([dt * steps]), dt * steps, steps, 3, 2)
     end = vp.TrackingCost(np.outer(np.arange(steps + 1.0), np.ones(3))).bind(last)
-    np.testing.assert_allclose(end.value(zero[:1], zero[:1], zero[:1, :2]), 3 * steps**2, rtol=1e-12)
+    assert_allclose(end.value(zero[:1], zero[:1], zero[:1, :2]), 3 * steps**2, rtol=1e-12)
 
 
 def test_sums_and_scales():
@@ -323,7 +324,7 @@ def test_custom_cost_from_its_value_alone(scale):
     found, size = bound.expand(*at), np.abs(bound.value(*at)).max()
     assert np.abs(found.gradient - gradient).max() < 1e-8 * size
     assert np.abs(found.hessian - hessian).max() < 1e-5 * size
-    np.testing.assert_array_equal(found.hessian, np.swapaxes(found.hessian, 1, 2))
+    assert_array_equal(found.hessian, np.swapaxes(found.hessian, 1, 2))
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-3, 0.1, 1.0])
@@ -470,7 +471,7 @@ def test_weights_are_copied_and_frozen():
     weight, a = np.ones(2), np.array([[0.1], [0.3], [-0.7]])
     cost = vp.ControlCost(weight)
     weight[:] = 5.0
-    np.testing.assert_array_equal(cost.weight, 1.0)
+    assert_array_equal(cost.weight, 1.0)
     with pytest.raises(ValueError, match="read-only"):
         cost.weight[0] = 2.0
     # Of rank one, with rounding below zero.

@@ -8,7 +8,6 @@ from oracles import slope
 from refusals import naming
 
 import varpin as vp
-from varpin.simulation.choice import integrator_for
 
 HELD = [vp.Midpoint(kick="held"), vp.Gauss(2, kick="held"), vp.Radau(2, kick="held")]
 
@@ -98,7 +97,8 @@ def test_drives_at_their_limits_do_not_cut_noise_off(kick):
     given = {} if kick is None else {"integrator": vp.Midpoint(kick=kick)}
     motion = vp.simulate(scene, [0.0], [0.0], dt=0.01, steps=50, rng=0, **given)
     np.testing.assert_allclose(motion.v[-1], strength * motion.dw.sum(axis=0) / mass, rtol=1e-6)
-    assert integrator_for(scene, np.zeros(1), 0.1).kick == "held"
+    problem = vp.OptimalControlProblem(scene, vp.ControlCost(1.0), [0.0], [0.0], dt=0.1, steps=2)
+    assert problem.integrator.kick == "held"
 
 
 @pytest.mark.parametrize("integrator", HELD, ids=str)

@@ -73,11 +73,12 @@ def test_margins_in_standard_deviations(name):
     """At margin 2 by at most 2.3 % of motions for each bound and node, at an active one by many."""
     problem = BOUNDED[name]()
     plan = vp.solve(problem, check=False)
-    assert plan.status is vp.Status.CONVERGED, plan.reason
+    assert plan.status.converged, plan.reason
     share = outside(problem, plan).max()
     assert share <= most_allowed()
+    # The linear model's margins do for two links under noise of constant strength.
+    assert (plan.search.counts > 0) == (name not in ("held", "linear", "torques"))
     if problem.scene.robot.dof > 2:
-        assert plan.search.counts > 0
         return
     assert share >= 0.5 * ndtr(-2.0)
     # Without noise the plan keeps away from the bound.

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from findings import about
 from mechanisms import slider
+from numpy.testing import assert_allclose, assert_array_equal
 from plan_problems import CAPSULES, TWO, swing, wave
 from refusals import naming, refused, unnamed
 
@@ -35,7 +36,7 @@ def test_a_linear_system_under_a_quadratic_cost_is_a_linear_feedback():
         part = vp.simulate(plant.scene, x[:1], x[1:], dt=5e-3, steps=10, controls=u, integrator=plant.integrator)
         motion.append(part.q[1:, 0])
         x = np.concatenate([part.q[-1], part.v[-1]])
-    np.testing.assert_allclose(run.motion.q[1:, 0], np.concatenate(motion), rtol=0, atol=1e-9)
+    assert_allclose(run.motion.q[1:, 0], np.concatenate(motion), rtol=0, atol=1e-9)
     assert run.motion.steps == 200
     assert run.motion.t[-1] == pytest.approx(1.0)
 
@@ -44,12 +45,12 @@ def test_what_is_planned_begins_where_the_plant_is():
     run = vp.Mpc(wave(t0=0.7)).run(vp.Plant(wave().scene, substeps=4), duration=0.8)
     assert len(run.plans) == 10
     ticks = run.motion.q[::4]
-    np.testing.assert_allclose(run.planned(0.0)[:-1], ticks[:-1], rtol=0, atol=1e-12)
+    assert_allclose(run.planned(0.0)[:-1], ticks[:-1], rtol=0, atol=1e-12)
     for k, plan in enumerate(run.plans):
-        np.testing.assert_allclose(run.planned(0.4)[k], plan.trajectory.q[5], rtol=0, atol=1e-12)
-        np.testing.assert_allclose(run.planned()[k], plan.trajectory.q[-1], rtol=0, atol=1e-12)
-        np.testing.assert_array_equal(run.planned(9.0)[k], plan.trajectory.q[-1])
-    np.testing.assert_allclose(run.planned(0.4)[-1], run.plans[-1].trajectory.q[6], rtol=0, atol=1e-12)
+        assert_allclose(run.planned(0.4)[k], plan.trajectory.q[5], rtol=0, atol=1e-12)
+        assert_allclose(run.planned()[k], plan.trajectory.q[-1], rtol=0, atol=1e-12)
+        assert_array_equal(run.planned(9.0)[k], plan.trajectory.q[-1])
+    assert_allclose(run.planned(0.4)[-1], run.plans[-1].trajectory.q[6], rtol=0, atol=1e-12)
 
 
 def test_ctrl_c_ends_a_run_while_it_plans():
@@ -126,7 +127,7 @@ def test_a_plan_that_has_no_successor_acts_to_its_end_and_is_held_there(controls
             # Steps have the means of the line over the tick, which begins where the one before ended.
             begin, found = (1.5 * motion.u[k - 1] - 0.5 * motion.u[k - 2] for k in (120, 130))
             held = held + policy.previous_gains[row] @ (begin - policy.u[7])
-        np.testing.assert_allclose(found, held, rtol=0, atol=1e-9)
+        assert_allclose(found, held, rtol=0, atol=1e-9)
         assert np.abs(run.motion.q[-1]).max() < 1.5
 
 
@@ -139,7 +140,7 @@ def test_a_cost_that_fails_keeps_the_motion_of_all_ticks_before():
         vp.Mpc(usual.at(cost=usual.cost + broken), iterations=1).run(duration=0.5)
     motion, cause = caught.value.trajectory, caught.value.__cause__
     assert motion.steps == 30
-    np.testing.assert_allclose(motion.q, whole.motion.q[:31], rtol=0, atol=1e-12)
+    assert_allclose(motion.q, whole.motion.q[:31], rtol=0, atol=1e-12)
     assert not unnamed(str(caught.value), "error.trajectory")
     assert isinstance(cause, vp.CostError)
     assert cause.trajectory is None
@@ -204,7 +205,7 @@ def test_a_problem_at_another_time_and_state_is_that_of_its_grid(cost):
     motion = made.simulate(np.random.default_rng(1).normal(size=(20, 2)))
     assert own.cost_of(motion) == made.cost_of(motion)
     for name in ("q0", "v0", "t0", "dt", "steps", "control_limits"):
-        np.testing.assert_array_equal(getattr(own, name), getattr(made, name))
+        assert_array_equal(getattr(own, name), getattr(made, name))
     assert not own.q0.flags.writeable
     with refused(vp.InputError, "q0"):
         own.at(q0=[0.1])
@@ -218,12 +219,12 @@ def test_a_shifted_plan_of_linear_controls_is_the_rest_of_it():
     for by in (0, 3, N):
         at = {"q0": motion.q[by], "v0": motion.v[by], "t0": by * 0.08}
         again = plan.problem.at(**at).simulate(plan.shifted(by))
-        np.testing.assert_allclose(again.u_nodes[: N + 1 - by], plan.controls[by:], rtol=0, atol=1e-8)
-        np.testing.assert_allclose(again.q[: N + 1 - by], motion.q[by:], rtol=0, atol=1e-11)
+        assert_allclose(again.u_nodes[: N + 1 - by], plan.controls[by:], rtol=0, atol=1e-8)
+        assert_allclose(again.q[: N + 1 - by], motion.q[by:], rtol=0, atol=1e-11)
     last = plan.shifted(N)
-    np.testing.assert_array_equal(last.u, np.tile(plan.controls[-1], (N, 1)))
-    np.testing.assert_array_equal(last.previous, np.tile(plan.controls[-1], (N, 1)))
-    np.testing.assert_array_equal(plan.shifted(2, before=[1.0, 2.0, 3.0]).before, [1.0, 2.0, 3.0])
+    assert_array_equal(last.u, np.tile(plan.controls[-1], (N, 1)))
+    assert_array_equal(last.previous, np.tile(plan.controls[-1], (N, 1)))
+    assert_array_equal(plan.shifted(2, before=[1.0, 2.0, 3.0]).before, [1.0, 2.0, 3.0])
     with refused(vp.InputError, "decisions", "8"):
         plan.shifted(N + 1)
 
@@ -241,7 +242,7 @@ def test_a_tick_with_linear_controls_is_its_problem_solved_anew(rate):
     anew = vp.solve(problem.at(q0=q, v0=v, t0=0.08, before=before), tolerance=1e-13, check=False)
     assert tick.status.converged
     # Costs agree to the tenth digit: controls to the fifth of theirs.
-    np.testing.assert_allclose(tick.controls, anew.controls, rtol=0, atol=1e-5 * 15.0)
+    assert_allclose(tick.controls, anew.controls, rtol=0, atol=1e-5 * 15.0)
     assert tick.cost == pytest.approx(anew.cost, rel=1e-10)
     # One iteration has one backward pass, and leaves a part of what the shifted plan has too much.
     start = vp.solve(anew.problem, first.shifted(1, before), max_iterations=0, check=False)
@@ -273,7 +274,7 @@ def test_errors_of_steps_do_not_add_up_in_the_loop():
         vp.Mpc(problem, iterations=1).run(vp.Plant(noisy, integrator=method), duration=3.0, rng=0)
         for method in (coarse, vp.Gauss(4, kick="held"))
     )
-    np.testing.assert_allclose(run.motion.q, better.motion.q, rtol=0, atol=1e-4)
+    assert_allclose(run.motion.q, better.motion.q, rtol=0, atol=1e-4)
     motion = run.motion
     given = {"dt": motion.dt, "steps": motion.steps, "controls": motion.u, "increments": motion.dw}
     assert about(vp.simulate(noisy, motion.q[0], motion.v[0], **given, integrator=coarse).warnings, "error")
@@ -313,11 +314,11 @@ def test_obstacles_are_where_they_are_at_each_time():
     for k, t in enumerate(0.4 + 0.03 * np.arange(1, 17)):
         still = bounded(round_things(t, False)).bound_constraints
         for moving, there, slope in zip((sphere, ball), still, slopes, strict=True):
-            np.testing.assert_allclose(moving[k], there.value(q, q, q[1:])[k], rtol=0, atol=1e-12)
-            np.testing.assert_allclose(slope[k], there.jacobian(q, q)[k], rtol=0, atol=1e-12)
+            assert_allclose(moving[k], there.value(q, q, q[1:])[k], rtol=0, atol=1e-12)
+            assert_allclose(slope[k], there.jacobian(q, q)[k], rtol=0, atol=1e-12)
     # Several motions at once, as a line search has them.
     both = problem.bound_constraints[1].value(np.array([q, -q]), np.array([q, q]), np.zeros((2, 16, 2)))
-    np.testing.assert_array_equal(both[0], ball)
+    assert_array_equal(both[0], ball)
 
 
 def test_ticks_that_find_no_plan_are_told_of():
@@ -333,23 +334,9 @@ def test_ticks_that_find_no_plan_are_told_of():
 def test_what_the_plant_violates_is_told_of():
     noisy = vp.Plant(vp.Scene(TWO, damping=0.3, noise=vp.AdditiveNoise(0.1)))
     run, again = (vp.Mpc(bounded(SPEEDS)).run(noisy, duration=0.6, rng=1) for _ in range(2))
-    np.testing.assert_array_equal(run.motion.q, again.motion.q)
+    assert_array_equal(run.motion.q, again.motion.q)
     assert 0.05 < run.constraints[0].violation < 0.4
     assert naming(run.warnings, "motion violates", "WithinVelocityLimits", "margin=", "narrower")
-
-
-def test_plans_of_ticks_are_saved_with_their_rows(tmp_path):
-    run = vp.Mpc(bounded(SPEEDS, controls="linear")).run(duration=0.15)
-    plan = run.plans[-1]
-    saved = vp.Solution.load(plan.save(tmp_path / "plan.npz"), plan.problem)
-    assert saved.violation == plan.violation
-    assert len(saved.constraints[0].t) == 2 * 16
-    np.testing.assert_array_equal(saved.multipliers.values, plan.multipliers.values)
-    kept = dict(np.load(tmp_path / "plan.npz", allow_pickle=False))
-    kept["multipliers.values"] = kept["multipliers.values"][:-1]
-    np.savez(tmp_path / "short.npz", **kept)
-    with refused(vp.FileError, "multipliers.backoff"):
-        vp.Solution.load(tmp_path / "short.npz", plan.problem)
 
 
 def test_ticks_within_speeds_are_close_to_their_optimum():
@@ -359,7 +346,13 @@ def test_ticks_within_speeds_are_close_to_their_optimum():
     cost = vp.TrackingCost(lambda t: begin + 0.35 * np.sin(2.0 * t) * np.cos(np.arange(6)), 100.0)
     cost += vp.VelocityCost(0.05) + vp.ControlCost(1e-4, scene.holding_torque(begin))
     problem = vp.OptimalControlProblem(
-        scene, cost, begin, np.zeros(6), dt=0.02, steps=25, constraints=[vp.WithinVelocityLimits(robot, (-0.3, 0.3))]
+        scene,
+        cost,
+        begin,
+        np.zeros(6),
+        dt=0.02,
+        steps=25,
+        constraints=[vp.WithinVelocityLimits(robot, (-0.3, 0.3))],
     )
     one, three = (vp.Mpc(problem, iterations=count).run(duration=0.6) for count in (1, 3))
     costs = [np.mean([plan.cost for plan in run.plans]) for run in (one, three)]

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from findings import about
+from numpy.testing import assert_allclose, assert_array_equal
 from oracles import lines
 from plan_problems import linear
 
@@ -209,18 +210,18 @@ def test_the_effect_of_noise_along_a_line(noise, kick):
         found[n:] += (1.0 - left) * after
         return found
 
-    np.testing.assert_allclose(lin.G[0], effect(at), atol=1e-12)
+    assert_allclose(lin.G[0], effect(at), atol=1e-12)
     derivatives = np.concatenate([lin.Gu - lin.Gramp, lin.Gramp], axis=3)[0]
     for c, away in enumerate(size * np.eye(4)):
         found = (effect(at + away) - effect(at - away)) / (2.0 * size)
-        np.testing.assert_allclose(derivatives[:, :, c], found, atol=1e-8)
+        assert_allclose(derivatives[:, :, c], found, atol=1e-8)
 
 
 def test_strong_noise_costs_what_the_plan_expects_in_fine_steps():
     """Controls that alternate do not escape it."""
     problem = reach(vp.ControlNoise(1.0), steps=10, controls="linear")
     plan = vp.solve(problem)
-    assert plan.status is vp.Status.CONVERGED
+    assert plan.status.converged
     assert not about(plan.warnings, "noise within steps")
     fine = problem.at(dt=problem.dt / 4)
     given = {"dt": fine.dt, "steps": fine.steps, "controls": plan.policy, "integrator": problem.integrator}
@@ -247,11 +248,11 @@ def test_paths_on_lines_are_repeated_and_examined_with_their_noise(kick, constra
     unknown = ["error"] if constrained and kick == "left" else []  # the repetition cannot have its noise
     assert [finding.kind for finding in motion.warnings] == unknown
     again = vp.simulate(scene, [0.2, 0.2], [0.0, 0.0], increments=motion.dw, **given)
-    np.testing.assert_array_equal(again.q, motion.q)
+    assert_array_equal(again.q, motion.q)
     # Without those of slopes these are zero.
     means = vp.simulate(scene, [0.2, 0.2], [0.0, 0.0], increments=motion.dw[:, :4], **given)
     zeros = np.hstack([motion.dw[:, :4], np.zeros((200, 2))])
-    np.testing.assert_array_equal(means.q, vp.simulate(scene, [0.2, 0.2], [0.0, 0.0], increments=zeros, **given).q)
+    assert_array_equal(means.q, vp.simulate(scene, [0.2, 0.2], [0.0, 0.0], increments=zeros, **given).q)
     assert np.abs(means.q - motion.q).max() > 1e-6
 
 
@@ -277,10 +278,10 @@ def test_the_drift_along_a_line_is_its_mean_over_the_step(integrator):
 
     mean = 0.5 * (u[:2] + u[2:])
     found = diffusion_and_drift(scene, problem.q0, problem.v0, mean, problem.q0, (u[None, :2], u[None, 2:]))[1]
-    np.testing.assert_allclose(found, (local(u[:2]) + 4.0 * local(mean) + local(u[2:])) / 6.0, atol=1e-14)
+    assert_allclose(found, (local(u[:2]) + 4.0 * local(mean) + local(u[2:])) / 6.0, atol=1e-14)
     assert np.abs(found - local(mean)).max() > 1e-2
     lin = vp.linearize(scene, problem.simulate(lines(problem, u.reshape(2, 2))))
     x, step = np.concatenate([problem.q0, problem.v0]), 1e-5
     by_control = np.concatenate([lin.B - lin.ramp, lin.ramp], axis=2)[0]
     for c, away in enumerate(step * np.eye(4)):
-        np.testing.assert_allclose(by_control[:, c], (ends(x, u + away) - ends(x, u - away)) / (2 * step), atol=1e-8)
+        assert_allclose(by_control[:, c], (ends(x, u + away) - ends(x, u - away)) / (2 * step), atol=1e-8)

@@ -6,6 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 from chromium import animation, commands
+from numpy.testing import assert_allclose
 from plan_problems import CAPSULES, TWO, reach
 from refusals import refused
 from scipy.optimize import nnls
@@ -71,8 +72,8 @@ def test_eight_points_are_a_box():
     for hull in (*made, pickle.loads(pickle.dumps(vp.Obstacle.convex(CUBE * sides, center, TURN)))):
         expected = known if hull.shift else measured(vp.Obstacle.box(center, sides, TURN))
         measure = measured(hull).over(times)
-        np.testing.assert_allclose(measure.distances(q), expected.distances(q), atol=1e-9)
-        np.testing.assert_allclose(measure.slopes(q), expected.slopes(q), atol=1e-8)
+        assert_allclose(measure.distances(q), expected.distances(q), atol=1e-9)
+        assert_allclose(measure.slopes(q), expected.slopes(q), atol=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +112,7 @@ def test_slopes_are_differences():
     slopes = measure.slopes(q)
     for c, e in enumerate(1e-6 * np.eye(6)):
         found = (measure.distances(q + e) - measure.distances(q - e)) / 2e-6
-        np.testing.assert_allclose(slopes[:, :, c], found, atol=1e-7)
+        assert_allclose(slopes[:, :, c], found, atol=1e-7)
     points = np.random.default_rng(1).normal(size=(500, 3)) * [1.0, 0.2, 0.1]
     begin, end, radius = capsule_around(points)
     along = np.clip((points - begin) @ (end - begin) / ((end - begin) @ (end - begin)), 0.0, 1.0)
@@ -149,13 +150,13 @@ def test_drawn_where_it_is(tmp_path):
     data = drawn["object"]["geometries"][0]["data"]
     at = np.array(placed["matrix"]).reshape(4, 4).T[:3, 3]
     seen = np.frombuffer(data["attributes"]["position"]["array"].data, dtype=np.float32).reshape(-1, 3) + at
-    np.testing.assert_allclose(np.sort(seen, axis=0), np.sort(known, axis=0), atol=1e-6)
+    assert_allclose(np.sort(seen, axis=0), np.sort(known, axis=0), atol=1e-6)
     faces = np.frombuffer(data["index"]["array"].data, dtype=np.uint32).reshape(-1, 3)
     a, b, c = (seen[faces[:, k]] for k in range(3))
     # The divergence theorem: the volume within the triangles.
     assert (a * np.cross(b, c)).sum() / 6.0 == pytest.approx(0.5 * 0.4 * 0.25 * 0.3, rel=1e-5)
     (track,) = [values for (path, _), (_, values) in animation(page)[0].items() if "notes" in path]
-    np.testing.assert_allclose(np.diff(track, axis=0), [[1.0, 0.0, 0.0]], atol=1e-6)
+    assert_allclose(np.diff(track, axis=0), [[1.0, 0.0, 0.0]], atol=1e-6)
 
 
 def srdf_of(path, *pairs):

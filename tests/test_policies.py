@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
 import varpin as vp
@@ -19,7 +20,11 @@ def policy(**options):
     rng = np.random.default_rng(0)
     gains = -np.tile(np.hstack([2.0 * np.eye(2), 0.5 * np.eye(2)]), (INTERVALS, 1, 1))
     return vp.LinearPolicy(
-        rng.normal(size=(INTERVALS, 2)), gains, np.zeros((INTERVALS, 4)), on="velocity", **{"period": PERIOD} | options
+        rng.normal(size=(INTERVALS, 2)),
+        gains,
+        np.zeros((INTERVALS, 4)),
+        on="velocity",
+        **{"period": PERIOD} | options,
     )
 
 
@@ -31,12 +36,12 @@ def run(given, dt, steps, **options):
 def test_a_policy_with_a_period_is_held_over_finer_steps(finer):
     given, dt = policy(), PERIOD / finer
     motion = run(given, dt, INTERVALS * finer)
-    np.testing.assert_array_equal(np.ptp(motion.u.reshape(INTERVALS, finer, 2), axis=1), 0.0)
+    assert_array_equal(np.ptp(motion.u.reshape(INTERVALS, finer, 2), axis=1), 0.0)
     for k in range(INTERVALS):
         x = np.concatenate([motion.q[finer * k], motion.v[finer * k]])
-        np.testing.assert_allclose(motion.u[finer * k], given.control(k, x), rtol=1e-12, atol=1e-12)
-    np.testing.assert_array_equal(motion.q, run(policy(hold=finer, period=None), dt, INTERVALS * finer).q)
-    np.testing.assert_allclose(run(motion.u, dt, INTERVALS * finer).q, motion.q, rtol=0.0, atol=1e-13)
+        assert_allclose(motion.u[finer * k], given.control(k, x), rtol=1e-12, atol=1e-12)
+    assert_array_equal(motion.q, run(policy(hold=finer, period=None), dt, INTERVALS * finer).q)
+    assert_allclose(run(motion.u, dt, INTERVALS * finer).q, motion.q, rtol=0.0, atol=1e-13)
 
 
 def test_ensembles_hold_it_alike():
@@ -45,7 +50,7 @@ def test_ensembles_hold_it_alike():
         SCENE, [Q0, Q0], REST, dt=PERIOD / 4, steps=4 * INTERVALS, paths=2, rng=0, controls=policy(),
         integrator=vp.RungeKutta4(),
     )  # fmt: skip
-    np.testing.assert_array_equal(paths.u[1], motion.u)
+    assert_array_equal(paths.u[1], motion.u)
 
 
 def test_a_plan_runs_at_finer_steps_as_it_is():
@@ -54,8 +59,13 @@ def test_a_plan_runs_at_finer_steps_as_it_is():
     plan = vp.solve(problem)
     assert plan.policy.period == 0.02
     finer = vp.simulate(SCENE, Q0, REST, dt=0.0025, steps=80, controls=plan.policy, integrator=vp.Gauss(4))
-    np.testing.assert_allclose(finer.q[::4], plan.trajectory.q, atol=1e-7)
-    for same in (plan.policy.without_feedback(), plan.shifted(1), problem.holding_policy(), plan.policy_on("velocity")):
+    assert_allclose(finer.q[::4], plan.trajectory.q, atol=1e-7)
+    for same in (
+        plan.policy.without_feedback(),
+        plan.shifted(1),
+        problem.holding_policy(),
+        plan.policy_on("velocity"),
+    ):
         assert (same.period, same.joints) == (0.02, CHAIN.joint_names)
 
 
@@ -81,11 +91,11 @@ def test_laws_and_functions_of_time_may_answer_by_joint_name():
     rows = np.array([[0.0, 200.0 * (np.sin((k + 1) * 0.01) - np.sin(k * 0.01))] for k in range(8)])
     options = {"dt": 0.01, "steps": 8, "integrator": vp.Midpoint()}
     pulled = vp.simulate(SCENE, Q0, REST, controls=vp.OpenLoop(pull), **options)
-    np.testing.assert_allclose(pulled.u, rows, rtol=1e-12)
+    assert_allclose(pulled.u, rows, rtol=1e-12)
     law = vp.simulate(SCENE, Q0, REST, controls=lambda t, q, v: {"joint1": -q[0]}, **options)
-    np.testing.assert_array_equal(law.u, np.column_stack([-law.q[:-1, 0], np.zeros(8)]))
+    assert_array_equal(law.u, np.column_stack([-law.q[:-1, 0], np.zeros(8)]))
     paths = vp.simulate_ensemble(SCENE, Q0, REST, controls=vp.OpenLoop(pull), paths=1, rng=0, **options)
-    np.testing.assert_array_equal(paths.u[0], pulled.u)
+    assert_array_equal(paths.u[0], pulled.u)
     with refused(vp.ControlError, "'join2'", "'joint2'"):
         vp.simulate(SCENE, Q0, REST, controls=vp.OpenLoop(lambda t: {"join2": t}), **options)
     geared = vp.Scene(CHAIN, actuation=2.0 * np.eye(2))
@@ -95,9 +105,9 @@ def test_laws_and_functions_of_time_may_answer_by_joint_name():
 
 def test_limits_of_policies_by_name():
     named = policy(limits=({"joint2": -0.5}, {"joint2": 0.5, "joint1": 1.0}), joints=SCENE.control_joints)
-    np.testing.assert_array_equal(named.limits, [[-np.inf, -0.5], [1.0, 0.5]])
+    assert_array_equal(named.limits, [[-np.inf, -0.5], [1.0, 0.5]])
     given = policy(limits=([-np.inf, -0.5], [1.0, 0.5]))
-    np.testing.assert_array_equal(run(named, PERIOD, INTERVALS).q, run(given, PERIOD, INTERVALS).q)
+    assert_array_equal(run(named, PERIOD, INTERVALS).q, run(given, PERIOD, INTERVALS).q)
     with refused(vp.InputError, "limits: lower", "joint name"):
         policy(limits=({"joint2": -0.5}, 1.0))
     with refused(vp.UnknownJoint, "'joint2'"):
@@ -115,10 +125,10 @@ def test_the_control_before_a_plan_by_name():
     for previous in (None, mpc.plan(0.0, Q0, REST)):
         named = mpc.plan(0.0, Q0, REST, previous, before={"joint2": 3.0})
         given = mpc.plan(0.0, Q0, REST, previous, before=[0.0, 3.0])
-        np.testing.assert_array_equal(named.controls, given.controls)
+        assert_array_equal(named.controls, given.controls)
         assert np.abs(named.controls - mpc.plan(0.0, Q0, REST, previous).controls).max() > 1e-3
     plan = mpc.plan(0.0, Q0, REST)
-    np.testing.assert_array_equal(plan.shifted(2, {"joint1": 1.0}).before, [1.0, 0.0])
+    assert_array_equal(plan.shifted(2, {"joint1": 1.0}).before, [1.0, 0.0])
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(3), vp.RungeKutta4(), vp.ExplicitEuler()], ids=str)
@@ -134,9 +144,9 @@ def test_a_law_is_called_once_where_each_period_begins(integrator):
     assert len(called) == 10
     for k, (t, q, v) in enumerate(called):
         assert t == pytest.approx(0.05 * k, abs=1e-12)
-        np.testing.assert_array_equal(q, motion.q[5 * k])
-        np.testing.assert_array_equal(v, motion.v[5 * k])
-        np.testing.assert_array_equal(np.ptp(motion.u[5 * k : 5 * k + 5], axis=0), 0.0)
+        assert_array_equal(q, motion.q[5 * k])
+        assert_array_equal(v, motion.v[5 * k])
+        assert_array_equal(np.ptp(motion.u[5 * k : 5 * k + 5], axis=0), 0.0)
     assert np.abs(np.diff(motion.u[::5], axis=0)).min() > 0.0
 
 
@@ -145,4 +155,4 @@ def test_noise_that_python_evaluates_keeps_the_period():
     for noise in (vp.CustomNoise(lambda q, v, u: np.eye(2) * 0.1, 2), vp.AdditiveNoise(0.1)):
         given = {"dt": 1e-2, "steps": 17, "controls": lambda t, q, v: -10.0 * q - v, "period": 5, "rng": 3}
         motions.append(vp.simulate(vp.Scene(CHAIN, noise=noise), Q0, REST, **given))
-    np.testing.assert_allclose(motions[0].u, motions[1].u, atol=1e-12)
+    assert_allclose(motions[0].u, motions[1].u, atol=1e-12)

@@ -126,7 +126,7 @@ def test_policy_on_velocities_and_back():
         other.simulate(plan.policy)
     # Warm-started from the plan, the search has next to nothing to do.
     again = vp.solve(other, plan)
-    assert again.status is vp.Status.CONVERGED
+    assert again.status.converged
     assert again.history[0].expected_decrease < 1e-2 * again.cost
 
 

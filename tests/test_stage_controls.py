@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from oracles import slope
 from refusals import refused
 
@@ -29,7 +30,7 @@ def moments(force, begin, dt):
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(1), vp.Radau(1), vp.ExplicitEuler()], ids=str)
 def test_one_stage_holds_the_mean(arm, integrator):
     motion = vp.simulate(arm, Q0, np.zeros(6), dt=0.01, steps=5, controls=vp.OpenLoop(force), integrator=integrator)
-    np.testing.assert_allclose(motion.u, [moments(force, 0.01 * k, 0.01)[0] for k in range(5)], rtol=1e-13)
+    assert_allclose(motion.u, [moments(force, 0.01 * k, 0.01)[0] for k in range(5)], rtol=1e-13)
     assert motion.u_stages.shape == (5, 0, 6)
 
 
@@ -41,8 +42,8 @@ def test_values_and_means(arm, integrator):
         of_force = moments(force, 0.01 * k, 0.01)[: len(times)]
         through = np.polynomial.legendre.legfit(times, motion.u_stages[k], len(times) - 1)
         own = through / (2.0 * np.arange(len(times)) + 1.0)[:, None]
-        np.testing.assert_allclose(own, of_force, rtol=0, atol=1e-12 * np.abs(of_force).max())
-        np.testing.assert_allclose(motion.u[k], of_force[0], rtol=1e-12)
+        assert_allclose(own, of_force, rtol=0, atol=1e-12 * np.abs(of_force).max())
+        assert_allclose(motion.u[k], of_force[0], rtol=1e-12)
     assert motion.part(2, 5).u_stages.shape == (3, len(times), 6)
 
 
@@ -87,7 +88,7 @@ def test_derivatives_of_steps_in_parts_against_differences(stages, balance):
         given = np.hstack([lin.A[k], lin.B[k], lin.ramp[k]])
         for c, e in enumerate(np.eye(4 * n)):
             found = slope(end, np.zeros(4 * n), e, 4e-5 if c < 2 * n else 4e-4)
-            np.testing.assert_allclose(given[:, c], found, rtol=0, atol=1e-8)
+            assert_allclose(given[:, c], found, rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize(("stages", "balance"), [(2, 1e-10), (3, 1e-13)])
@@ -136,8 +137,8 @@ def test_a_function_of_many_times_makes_the_motion_of_one_of_each(integrator):
     called.clear()
     for controls in (vp.OpenLoop(lists), vp.OpenLoop(vectorized, vectorized=True)):
         again = vp.simulate(scene, CHAIN_Q, CHAIN_V, controls=controls, **options)
-        np.testing.assert_array_equal(again.u, motion.u)
-        np.testing.assert_array_equal(again.q, motion.q)
+        assert_array_equal(again.u, motion.u)
+        assert_array_equal(again.q, motion.q)
     # For the motion, for its means, and for its repetition: the first time of each is alone.
     assert len(called) <= 6
 
