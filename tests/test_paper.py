@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from refusals import refused
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 from paper import cases, experiments
@@ -18,6 +19,8 @@ from paper.claims import Claim, assess, free_motions
 from paper.experiments import OPTIMUM, PLAIN, STOCHASTIC, Cell, Task, fill, run, tasks
 from paper.figures import draw
 from paper.report import write
+
+import varpin as vp
 
 FIGURES = ["figure1", "figure2", "figure3", "figure4", "figure5", "truth", "noise"]
 
@@ -41,7 +44,7 @@ def made_up(task):
         open_loop=4e-6 * (1.0 + error),
         closed_loop=np.nan if task.method == "Euler" else 4e-6 * (1.0 + error),
         accuracy=1e-11,
-        sampled=(8e-6 if task.method == PLAIN else 4e-6 * (1.0 + error) + noise, 1e-9),
+        sampled=np.array([8e-6 if task.method == PLAIN else 4e-6 * (1.0 + error) + noise, 1e-9]),
         t=t,
         q=np.array([cases.reference(x) for x in t]) + 1e-3 * error,
         u=1e-4 * np.column_stack([np.sin(t[:-1]), np.cos(t[:-1]), t[:-1]]),
@@ -145,6 +148,10 @@ def test_a_second_fill_computes_nothing(tmp_path, counted):
     for name in names:
         for item in dataclasses.fields(Cell):
             np.testing.assert_array_equal(getattr(first[name], item.name), getattr(second[name], item.name))
+    (damaged, *_) = tmp_path.iterdir()
+    damaged.write_bytes(damaged.read_bytes()[:-100])
+    with refused(vp.FileError, damaged.name):
+        fill(tmp_path, quick=True)
 
 
 def test_claims_hold_where_the_paper_is_right_and_not_where_euler_is_better(cells, motions):
