@@ -81,20 +81,24 @@ def test_verification_under_friction_that_is_too_fast_for_explicit_steps():
     assert found.open_loop_cost == pytest.approx(true, rel=1e-4)
 
 
-def test_noise_beyond_the_width_of_friction_costs_more_than_the_model_says():
-    """Linearized friction damps noise that the friction hardly feels; paths tell."""
+def test_noise_beyond_the_width_of_friction_is_reported():
+    """Linearized friction damps noise that the friction hardly feels."""
     robot = vp.planar_chain(2)
 
-    def paths(noise):
+    def plan(noise):
         forces = [vp.CoulombFriction(0.3, 0.02)]
         scene = vp.Scene(robot, gravity=False, forces=forces, noise=vp.AdditiveNoise(noise))
         cost = vp.ControlCost(1.0) + vp.TrackingCost([0.0, 0.0], 1.0)
         problem = vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], dt=0.01, steps=30)
-        return vp.solve(problem).monte_carlo(paths=100, rng=0)
+        return vp.solve(problem)
 
-    loud, calm = paths(0.3), paths(1e-4)
-    assert loud.cost > 3.0 * loud.predicted
-    assert calm.cost == pytest.approx(calm.predicted, abs=4.0 * calm.standard_error)
+    loud, calm = plan(0.3), plan(1e-4)
+    paths = loud.monte_carlo(paths=100, rng=0)
+    assert paths.cost > 3.0 * paths.predicted
+    told = [any(told.kind == "friction under noise" for told in found.warnings) for found in (loud, calm)]
+    assert told == [True, False]
+    paths = calm.monte_carlo(paths=100, rng=0)
+    assert paths.cost == pytest.approx(paths.predicted, abs=4.0 * paths.standard_error)
 
 
 def test_an_arm_comes_to_rest():

@@ -97,10 +97,11 @@ def test_linear_controls_are_lines_through_the_nodes():
     np.testing.assert_allclose(line.get_xydata(), np.column_stack([motion.t, nodes]), atol=1e-12)
 
 
-@pytest.mark.parametrize("shape", [(3,), (1, 1), (2, 2, 2)])
-def test_controls_of_a_motion_whose_file_has_ties_of_another_shape(shape):
+@pytest.mark.parametrize("rows", [np.ones(3), np.ones((1, 1)), np.ones((2, 2, 2)), np.full((1, 3), np.nan)])
+@pytest.mark.parametrize("kind", ["constraints.ties", "PositionServo"])
+def test_controls_of_a_motion_whose_file_has_other_numbers(kind, rows):
     motion = vp.simulate(vp.Scene(vp.planar_chain(1)), [0.1], [0.0], dt=0.01, steps=2)
-    odd = dataclasses.replace(motion, scene_values={**motion.scene_values, "constraints.ties": np.ones(shape)})
+    odd = dataclasses.replace(motion, scene_values={**motion.scene_values, kind: rows})
     assert plots.plot_controls(odd)[1].get_ylabel() == "control [N m or N]"
 
 

@@ -5,7 +5,6 @@ Equation (O14) of docs/mathematics.md.
 
 from __future__ import annotations
 
-import pickle
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -20,7 +19,7 @@ from varpin.arrays import Floats
 from varpin.control import Solution, solve
 from varpin.errors import VarpinError
 from varpin.integrators import RungeKutta4
-from varpin.io.archive import atomic_file
+from varpin.io.archive import read_npz, record_of, save_npz
 from varpin.linearization import linearize
 
 Progress = Callable[[int, int, str], None]
@@ -32,6 +31,7 @@ FINEST = 1.25e-4
 OPTIMUM = "optimum"
 # With the noise in the search, and with a search that knows nothing of it.
 STOCHASTIC, PLAIN = "S-DDP", "DDP"
+_FORMAT = "varpin.paper/1"
 _PATHS = 400
 _MORE_PATHS = 1000
 # Where gains of different time steps are compared [s].
@@ -74,7 +74,7 @@ class Cell:
     open_loop: float
     closed_loop: float
     accuracy: float
-    sampled: tuple[float, float] = (np.nan, np.nan)
+    sampled: Floats = field(default_factory=lambda: np.full(2, np.nan))
     t: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
     q: Floats = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
     u: Floats = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
@@ -179,7 +179,7 @@ def _cell(task: Task, solution: Solution, seconds: float, sampled: tuple[float, 
         open_loop=truth.open_loop_cost,
         closed_loop=truth.closed_loop_cost,
         accuracy=truth.accuracy,
-        sampled=sampled,
+        sampled=np.array(sampled),
         t=trajectory.t[::hold],
         q=trajectory.q[::hold],
         u=solution.controls,
@@ -208,6 +208,9 @@ def fill(folder: Path, *, quick: bool, progress: Progress | None = None) -> dict
     """All cells, by the names of their tasks; those of this version in the folder are not computed again.
 
     Ctrl-C loses the cell it interrupts and no other.
+
+    Raises:
+        FileError: A cell in the folder is damaged; without its file it is computed again.
     """
     folder.mkdir(parents=True, exist_ok=True)
     todo = list(tasks(quick=quick))
@@ -215,9 +218,8 @@ def fill(folder: Path, *, quick: bool, progress: Progress | None = None) -> dict
     for number, task in enumerate(todo):
         if progress is not None:
             progress(number, len(todo), task.name)
-        path = folder / f"{task.name}_{__version__}.pickle"
+        path = folder / f"{task.name}_{__version__}.npz"
         if not path.is_file():
-            with atomic_file(path) as stream:
-                stream.write(pickle.dumps(run(task)))
-        cells[task.name] = pickle.loads(path.read_bytes())
+            save_npz(path, _FORMAT, run(task))
+        cells[task.name] = record_of(Cell, read_npz(path, _FORMAT), path)
     return cells

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import reprlib
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -415,11 +416,14 @@ def require_trajectory(motion: object) -> Trajectory:
     raise InputError(f"the motion must be a varpin.Trajectory, got {type(motion).__name__}{hint}")
 
 
-def kinematic_input_rows(trajectory: Trajectory) -> Floats:
-    """Rows (joint, joint, rate, ...) of a record's ties that are kinematic inputs: joints tied to themselves."""
-    none = np.zeros((0, 3))
-    ties = trajectory.scene_values.get("constraints.ties", none)
-    # A file may have other shapes.
-    if ties.ndim != 2 or ties.shape[1] < 3:
-        return none
-    return np.asarray(ties[ties[:, 0] == ties[:, 1]], dtype=np.float64)
+def kinematic_input_rows(trajectory: Trajectory) -> Integers:
+    """Rows (joint, joint, rate) of a record's ties that are kinematic inputs: joints tied to themselves."""
+    ties = scene_indices(trajectory, "constraints.ties", 3)
+    return ties[ties[:, 0] == ties[:, 1]]
+
+
+def scene_indices(trajectory: Trajectory, kind: str, columns: int) -> Integers:
+    """The indices (K, columns) with which a record's rows of a kind begin; a file may have other numbers there."""
+    rows = trajectory.scene_values.get(kind, np.zeros(0))
+    found = rows[:, :columns] if rows.ndim == 2 and rows.shape[1] >= columns else np.zeros((0, columns))
+    return found[(np.abs(found) < sys.maxsize).all(axis=1)].astype(np.int64)

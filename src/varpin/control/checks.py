@@ -14,7 +14,7 @@ from varpin.arrays import Floats
 from varpin.control.constraints import KeepInBox, ReachFrame, WithinJointLimits
 from varpin.control.costs import FramePositionCost, TrackingCost, weight_matrix
 from varpin.control.margins import too_small
-from varpin.control.noise import noise_cost
+from varpin.control.noise import covariances, noise_cost
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.sizes import FEASIBLE, HARMLESS, NOTABLE, SLIGHT, TRACE
 from varpin.control.solution import Solution
@@ -22,6 +22,7 @@ from varpin.control.stages import Feedback, Steps
 from varpin.control.verification import Played, at_start, excess, in_parts, percent, replays
 from varpin.errors import VarpinError
 from varpin.finding import Finding, announce, ranked
+from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import closest_controls
 from varpin.model import (
     ADVICE,
@@ -44,6 +45,8 @@ logger = logging.getLogger(__name__)
 
 # Parts of a step in which a plan is played again; from 2 to 8.
 _PARTS = 4
+# Standard deviation of a velocity, in widths of its dry friction, up to which tanh is linear to 6 %.
+_LINEAR_FRICTION = 0.25
 # Angle of a swing under gravity from which on no step follows it [rad]: a quarter of a period.
 _QUARTER = 0.5 * np.pi
 
@@ -280,10 +283,35 @@ def _noise(solution: Solution) -> Iterator[Finding]:
         yield Finding("margins of velocities", sentence)
     yield from too_small(solution)
     # A custom noise or cost, or the linearization, may fail off the plan.
-    try:
-        yield from _in_halves(solution)
-    except VarpinError as error:
-        logger.info("%s: %s", problem.scene.robot.name, error)
+    for look in (_friction, _in_halves):
+        try:
+            yield from look(solution)
+        except VarpinError as error:
+            logger.info("%s: %s", problem.scene.robot.name, error)
+
+
+def _friction(solution: Solution) -> Iterator[Finding]:
+    """A finding if noise moves a joint by more than its dry friction is linear for."""
+    problem, motion, n = solution.problem, solution.trajectory, solution.problem.scene.robot.dof
+    rubbing = of_kind(problem.scene.elements, "CoulombFriction")
+    if not rubbing:
+        return
+    steps = Steps(problem, motion)
+    of_speeds = steps.slopes[:, n:]
+    P = covariances(steps, Feedback(solution.gains, solution.previous_gains))
+    spread = np.sqrt(np.maximum(np.einsum("kvx,kxy,kvy->kv", of_speeds, P, of_speeds), 0.0))
+    joints, widths = [own.coordinate for own in rubbing], np.array([own.values[1] for own in rubbing])
+    # At speed dry friction is constant, and noise changes it little.
+    slow = np.abs(motion.v[:, joints]) < 3.0 * (widths + spread[:, joints])
+    ratios = np.where(slow, spread[:, joints] / widths, 0.0).max(axis=0)
+    worst = int(ratios.argmax())
+    if ratios[worst] > _LINEAR_FRICTION:
+        name, unit = motion.joint_names[joints[worst]], joint_unit(problem.scene.robot, joints[worst], speed=True)
+        sentence = (
+            f"noise moves joint {name!r} by {ratios[worst]:.2g} widths of its dry friction ({widths[worst]:g} {unit}), "
+            "which noise_cost, gains and margins take as linear: use plan.monte_carlo()"
+        )
+        yield Finding("friction under noise", sentence, name, value=float(ratios[worst]), unit="widths")
 
 
 def _in_halves(solution: Solution) -> Iterator[Finding]:

@@ -19,7 +19,7 @@ from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
 from varpin.show.given import motion_of, problem_of
-from varpin.trajectory import Trajectory, kinematic_input_rows, require_trajectory
+from varpin.trajectory import Trajectory, kinematic_input_rows, require_trajectory, scene_indices
 
 if TYPE_CHECKING:
     # Imported for types alone: plotting a joint needs no optimizer.
@@ -258,17 +258,15 @@ def _of_controls(trajectory: Trajectory, robot: Robot | None) -> tuple[list[Line
     # A file may have an actuation of another shape.
     if actuation.shape != (len(forces), len(lines)):
         return lines, joints
-    servos = trajectory.scene_values.get("PositionServo", np.zeros((0, 1)))
-    inputs = kinematic_input_rows(trajectory)
-    placed = {int(joint) for joint in [*servos.reshape(-1, max(1, servos.shape[-1]))[:, 0], *inputs[:, 0]]}
+    inputs = kinematic_input_rows(trajectory).tolist()
+    placed = {joint for joint, *_ in [*inputs, *scene_indices(trajectory, "PositionServo", 1).tolist()]}
     for control, column in enumerate(actuation.T):
         acts = np.flatnonzero(column)
         if len(acts) == 1:
             joints[control] = joint = int(acts[0])
             lines[control] = (positions if joint in placed else forces)[joint]
-    for row in inputs:
+    for joint, _, control in inputs:
         # The velocity of a cubic input is a control of its own, whose column is 0.
-        joint, control = int(row[0]), int(row[2])
         if 0 <= control < len(lines) and 0 <= joint < len(rates) and not actuation[:, control].any():
             joints[control], lines[control] = joint, rates[joint]
     return lines, joints
