@@ -1,19 +1,14 @@
-"""The paper's experiments: its problem, cells of it; all of it, slowly, by the command line."""
+"""The paper's experiments: cells, claims and the report on made-up cells; all of it, slowly, by the command line."""
 
 import csv
+import dataclasses
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-<<<<<<< HEAD
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-from paper import cases
-from paper.cases import CASES, COARSE, COARSEST, MAIN
-from paper.experiments import OPTIMUM, Task, run
-=======
 from PIL import Image
 from refusals import refused
 
@@ -101,7 +96,6 @@ def test_tasks_are_complete_and_have_names_of_their_own():
     assert names > {task.name for task in tasks(quick=True)}
     # Names are file names.
     assert all(re.fullmatch(r"[\w.-]+", name) for name in names)
->>>>>>> x-F
 
 
 def test_the_problem_is_the_papers():
@@ -122,7 +116,10 @@ def test_a_coarse_cell_is_what_it_says():
     assert (cell.setting, cell.case, cell.method, cell.dt) == ("main", "2", "variational", COARSE)
     assert cell.status == "CONVERGED"
     assert cell.iterations <= 4
-    assert (cell.q.shape, cell.u.shape, cell.gains.shape) == ((251, 3), (250, 3), (47, 3, 6))
+    assert cell.t.shape == (251,)
+    assert cell.q.shape == (251, 3)
+    assert cell.u.shape == (250, 3)
+    assert cell.gains.shape == (47, 3, 6)
     assert np.isfinite(cell.gains).all()
     assert np.abs(cell.q - [cases.reference(t) for t in cell.t]).max() < 0.01
     assert 0.0 < cell.noise_cost < cell.cost < 1e-5
@@ -140,8 +137,6 @@ def test_nothing_beats_the_optimum_over_held_controls():
     assert np.isnan(own.sampled).all()
 
 
-<<<<<<< HEAD
-=======
 def test_a_second_fill_computes_nothing(tmp_path, counted):
     seen = []
     first = fill(tmp_path, quick=True, progress=lambda done, cells, name: seen.append((done, cells, name)))
@@ -204,7 +199,6 @@ def test_report_has_every_figure_and_every_cell(tmp_path, cells, motions, figure
     assert list(claims[0].values()) == [claim.source, claim.sentence, claim.measured, claim.verdict]
 
 
->>>>>>> x-F
 @pytest.mark.slow
 def test_quick_reproduction(tmp_path):
     folder = tmp_path / "paper"
@@ -221,12 +215,14 @@ def test_quick_reproduction(tmp_path):
         (one,) = [value for key, value in found.items() if words in " ".join(key)]
         return one
 
-    right = ("figure 1", "equivalent to the classic DDP", "table 1 and figure 5, case 1", "figure 5b, case 2")
-    assert {verdict_of(words) for words in (*right, "true cost is never above Euler's")} == {"holds"}
+    assert verdict_of("figure 1") == "holds"
+    assert verdict_of("equivalent to the classic DDP") == "holds"
+    assert verdict_of("table 1 and figure 5, case 1") == "holds"
+    assert verdict_of("figure 5b, case 2") == "holds"
     assert verdict_of("table 1, case 3") == "does not hold"
     assert verdict_of("algorithm iterations") == "holds in part"
     assert verdict_of("gains, referred to the middle") == "not measured"
-    assert len([*folder.glob("*.png")]) == 7
+    assert verdict_of("true cost is never above Euler's") == "holds"
 
     kept = {path: path.stat().st_mtime_ns for path in (folder / "cells").iterdir()}
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)

@@ -419,7 +419,8 @@ def require_trajectory(motion: object) -> Trajectory:
 def kinematic_input_rows(trajectory: Trajectory) -> Integers:
     """Rows (joint, joint, rate) of a record's ties that are kinematic inputs: joints tied to themselves."""
     ties = scene_indices(trajectory, "constraints.ties", 3)
-    return ties[ties[:, 0] == ties[:, 1]]
+    own: Integers = ties[ties[:, 0] == ties[:, 1]]
+    return own
 
 
 def scene_indices(trajectory: Trajectory, kind: str, columns: int) -> Integers:
