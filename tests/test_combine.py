@@ -3,7 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from mechanisms import joint, link, mimic, random_tree, write_urdf
+from mechanisms import joint, link, mimic, random_rotation, random_tree, write_urdf
 from refusals import refused
 
 import varpin as vp
@@ -114,27 +114,48 @@ def test_what_robots_know_goes_along(arms):
     assert len(both.ties) == 1
 
 
-def placed(robot, q):
-    """Where the shapes of a robot are, by name."""
-    shapes, data = geometry(robot), robot.model.createData()
-    of_shapes = shapes.createData()
-    pin.updateGeometryPlacements(robot.model, data, shapes, of_shapes, robot.configuration(q))
-    return {shape.name: place.homogeneous for shape, place in zip(shapes.geometryObjects, of_shapes.oMg, strict=True)}
+def assert_placed(robot, q, expected):
+    """The robot's shapes at q (n,) are where they should be, by name."""
+    found = placed(robot.model, geometry(robot), robot.configuration(q))
+    assert found.keys() == expected.keys()
+    for name, place in expected.items():
+        np.testing.assert_allclose(found[name].homogeneous, place.homogeneous, atol=1e-12)
+
+
+def placed(model, shapes, q):
+    data = shapes.createData()
+    pin.updateGeometryPlacements(model, model.createData(), shapes, data, q)
+    return {shape.name: place.copy() for shape, place in zip(shapes.geometryObjects, data.oMg, strict=True)}
 
 
 @pytest.mark.slow
 def test_shapes_stand_where_the_parts_put_them(arms):
-    both = vp.combine(*arms, placements=[None, PLACE])
-    q = np.random.default_rng(1).normal(size=both.dof)
-    moved = {name: PLACE.homogeneous @ place for name, place in placed(arms[1], q[8:]).items()}
-    expected, found = placed(arms[0], q[:8]) | moved, placed(both, q)
-    assert found.keys() == expected.keys()
-    for name, place in expected.items():
-        np.testing.assert_allclose(found[name], place, atol=1e-12)
+    both, q = vp.combine(*arms, placements=[None, PLACE]), np.random.default_rng(1).normal(size=14)
+    first, second = (
+        placed(robot.model, geometry(robot), robot.configuration(own))
+        for robot, own in zip(arms, (q[:8], q[8:]), strict=True)
+    )
+    assert_placed(both, q, first | {name: PLACE * place for name, place in second.items()})
     shapes, missing = readable_geometry(both)
     assert not missing
     for shape in shapes.geometryObjects:
         assert both.model.frames[shape.parentFrame].parentJoint == shape.parentJoint
+
+
+@pytest.mark.parametrize("lock", [{}, {"joint1": 0.4}, {"joint0": -0.3, "joint5": 1.2}])
+def test_shapes_of_a_wrapper_stand_as_in_the_unlocked_model(lock):
+    model, rng = random_tree(11, branching=False), np.random.default_rng(0)
+    shapes = pin.GeometryModel()
+    for k in range(1, model.njoints):
+        place = pin.SE3(random_rotation(rng), rng.normal(size=3))
+        shapes.addGeometryObject(pin.GeometryObject(f"shape{k}", k, place, pin.hppfcl.Sphere(0.1)))
+    whole, robot = (vp.load_robot(pin.RobotWrapper(model, visual_model=shapes), lock=at) for at in ({}, lock))
+    assert all(shape.parentFrame < robot.model.nframes for shape in geometry(robot).geometryObjects)
+    q = rng.uniform(-2.0, 2.0, whole.dof)
+    for name, position in lock.items():
+        q[whole.coordinate(name)] = position
+    own = [whole.coordinate(name) for name in robot.joint_names]
+    assert_placed(robot, q[own], placed(model, shapes, whole.configuration(q)))
 
 
 def test_names_that_clash_get_a_prefix(arms):

@@ -1,8 +1,5 @@
 """Crocoddyl's solvers on varpin's steps find what varpin's own finds. Needs ``pip install "varpin[crocoddyl]"``."""
 
-import re
-from pathlib import Path
-
 import numpy as np
 import pytest
 import zoo
@@ -130,12 +127,6 @@ def test_a_step_that_fails_shortens_the_line_search():
     model.calc(data, np.full(12, np.nan), np.zeros(6))
     assert np.isnan(data.xnext).all()
     assert data.cost == np.inf
-
-
-def test_the_page_on_crocoddyl_runs():
-    page = (Path(__file__).parents[1] / "docs" / "crocoddyl.md").read_text(encoding="utf-8")
-    (block,) = re.findall(r"^```python\n(.*?)^```$", page, re.M | re.S)
-    exec(block, {"problem": PROBLEMS["midpoint"]()})
 
 
 def test_a_closed_loop():

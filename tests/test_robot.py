@@ -6,7 +6,7 @@ import naive
 import numpy as np
 import pinocchio as pin
 import pytest
-from mechanisms import arm, joint, link, mass_matrix, mimic, random_inertia, random_rotation, random_tree, write_urdf
+from mechanisms import arm, joint, link, mass_matrix, mimic, random_inertia, random_tree, write_urdf
 from oracles import placements
 from refusals import naming, refused
 
@@ -105,29 +105,6 @@ class TestSources:
         expected = naive.lagrangian(scene, q, v)
         for backend in ("compiled", "pinocchio"):
             assert pytest.approx(expected, rel=1e-13) == vp.lagrangian_jet(scene, q, v, backend=backend).L
-
-
-@pytest.mark.parametrize("lock", [{}, {"joint1": 0.4}, {"joint0": -0.3, "joint5": 1.2}])
-def test_shapes_of_a_wrapper_move_as_in_the_unlocked_model(lock):
-    model, rng = random_tree(11, branching=False), np.random.default_rng(0)
-    shapes = pin.GeometryModel()
-    for k in range(1, model.njoints):
-        placement = pin.SE3(random_rotation(rng), rng.normal(size=3))
-        shapes.addGeometryObject(pin.GeometryObject(f"shape{k}", k, placement, pin.hppfcl.Sphere(0.1)))
-    whole = vp.load_robot(model)
-    robot = vp.load_robot(pin.RobotWrapper(model, pin.GeometryModel(), shapes), lock=lock)
-    visuals = geometry(robot)
-    assert all(shape.parentFrame < robot.model.nframes for shape in visuals.geometryObjects)
-    q = rng.uniform(-2.0, 2.0, robot.dof)
-    positions = dict(zip(robot.joint_names, q, strict=True)) | lock
-    full = np.array([positions[name] for name in whole.joint_names])
-    ours, theirs = visuals.createData(), shapes.createData()
-    pin.updateGeometryPlacements(robot.model, robot.model.createData(), visuals, ours, robot.configuration(q))
-    pin.updateGeometryPlacements(model, model.createData(), shapes, theirs, whole.configuration(full))
-    assert visuals.ngeoms == shapes.ngeoms
-    for k, shape in enumerate(shapes.geometryObjects):
-        mine = ours.oMg[visuals.getGeometryId(shape.name)]
-        assert np.abs(mine.homogeneous - theirs.oMg[k].homogeneous).max() < 1e-12
 
 
 def test_keeping_locks_all_other_joints_where_they_may_be(load):

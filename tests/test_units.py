@@ -188,16 +188,10 @@ def ball(r, at, distance):
 @pytest.mark.parametrize(
     ("make", "named"),
     [
-        (lambda r, k: ball(r, k * np.array([0.9, 0.5, 0.4]), 0.0), "ball is"),
-        (lambda r, k: ball(r, [2.0, 0.5, 0.4], k * 0.1), "KeepClear: the distance"),
-        (
-            lambda r, k: vp.KeepOutOfSphere(r, "tool0", k * np.array([0.9, 0.3, 0.4]), 0.1),
-            "KeepOutOfSphere('tool0'): the",
-        ),
-        (
-            lambda r, k: vp.KeepInHalfSpace(r, "tool0", [0.0, 0.0, 1.0], k * -0.3),
-            "KeepInHalfSpace('tool0'): the",
-        ),
+        (lambda r, k: ball(r, k * np.array([0.9, 0.5, 0.4]), 0.0), "ball"),
+        (lambda r, k: ball(r, [2.0, 0.5, 0.4], k * 0.1), ("KeepClear", "distance")),
+        (lambda r, k: vp.KeepOutOfSphere(r, "tool0", k * np.array([0.9, 0.3, 0.4]), 0.1), "KeepOutOfSphere"),
+        (lambda r, k: vp.KeepInHalfSpace(r, "tool0", [0.0, 0.0, 1.0], k * -0.3), "KeepInHalfSpace"),
     ],
 )
 def test_millimetres_in_obstacles_and_regions(scene, make, named, scale):
