@@ -96,6 +96,14 @@ def test_noise(integrator):
     agree(moved(scene, integrator, increments=dw), truth, rel=rel)
 
 
+@pytest.mark.parametrize("integrator", [MIDPOINT, RK4], ids=str)
+def test_a_law_that_its_record_tells_acts_on_the_repetition(integrator):
+    gains = -np.hstack([np.diag([20.0, 10.0, 3.0]), np.diag([8.0, 4.0, 1.0])])
+    law = {"controls": lambda t, q, v: gains @ np.append(q, v)}
+    fine = moved(FREE, vp.Gauss(4), dt=0.02 / 16, steps=640, period=16, check=False, **law)
+    agree(moved(FREE, integrator, **law), fine.q[::16])
+
+
 def test_kinematic_inputs():
     scene = vp.Scene(CHAIN, constraints=vp.KinematicInput("joint1"), actuation=["joint1"])
     t, start = 0.02 * np.arange(41), (Q0, np.array([1.2, 0.0, 1.0]))
@@ -180,6 +188,7 @@ def test_advice(options, integrator, dt):
     assert told.unit == unit
     assert not unnamed(told, f"{told.value:.2g} {unit}", f"'{told.joint}'", f"t = {told.time:.3g} s")
     family, stages = re.search(r"integrator=varpin\.(\w+)\((\d)\)", told).groups()
+    assert (family == "Radau") == ("damping" in options)
     better = moved(scene, getattr(vp, family)(int(stages)), dt=dt, steps=steps)
     assert not about(better.warnings, "error")
     follow(scene, told, integrator, 0.8, (Q0, V0), again=3)

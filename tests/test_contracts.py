@@ -196,7 +196,6 @@ PATHS = [
 
 
 def motion_of(case: zoo.Case, integrator: vp.Integrator, signal: Signal, parts: int, **options: object):
-    """A motion over the span of the case in PIECES * parts steps, without noise."""
     steps = PIECES * parts
     given = {"dt": case.span / steps, "steps": steps, "integrator": integrator, "check": False, **options}
     if case.scene.processes and "rng" not in given:

@@ -147,7 +147,6 @@ class TestWhereItFails:
         self.check(info.value)
 
     def test_coarse_steps_may_fail(self):
-        """Where the motion itself keeps clear, only their runs are lost."""
         reach = vp.simulate(vp.Scene(ROBOT, damping=1.0), Q0, V0, dt=1e-3, steps=100).q[:, 0].max() + 2e-3
 
         def edge(q, v):

@@ -46,13 +46,6 @@ def test_each_against_its_formula(name):
             assert lost == pytest.approx((drive - rest) * rate, rel=1e-13, abs=1e-15)
 
 
-def test_servos_far_faster_than_the_step_go_where_they_are_told():
-    stiff = vp.Scene(vp.planar_chain(2), forces=vp.PositionServo(1e7, 1e5))
-    options = {"dt": 1e-2, "steps": 100, "controls": [0.1, -0.1], "integrator": vp.Radau(2)}
-    motion = vp.simulate(stiff, [0.0, 0.0], [0.0, 0.0], **options)
-    np.testing.assert_allclose(motion.q[-1], [0.1, -0.1], atol=1e-4)
-
-
 def test_what_holds_an_arm_on_servos_is_a_position():
     robot = vp.load_robot("ur5")
     q = np.array([0.1, -0.8, 1.1, 0.2, -0.4, 0.3])

@@ -26,7 +26,6 @@ def test_friction_never_adds_energy(integrator, width):
 
 
 def test_friction_so_fast_that_steps_take_very_short_parts():
-    """Joints of an arm ring that should rest; the method that stops them takes parts of a step of 1e-4 and less."""
     scene = vp.Scene(vp.load_robot("ur5"), forces=vp.CoulombFriction([8.0, 8.0, 5.0, 2.0, 2.0, 1.0], 1e-5))
     begin, speed = np.array([0.0, -1.2, 1.5, -0.5, 0.3, 0.2]), np.array([1.0, 1.0, -1.0, 1.0, 2.0, 2.0])
     stopped = vp.simulate(scene, begin, speed, dt=1e-2, steps=60, integrator=vp.Radau(3))
