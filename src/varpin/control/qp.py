@@ -169,6 +169,7 @@ class _Form:
                 settings.eps_abs, settings.eps_rel, settings.max_iter = _RESIDUAL, _RESIDUAL, _STEPS
                 solver.setup(P, c, A, b, G, None, most, lower, upper)
             status, known = solver.solve(), solver.result.info
+            # Where weights are far apart more is left: a tenth of what a row may be violated by does no harm.
             rounded = max(known.primal_res, known.dual_res) <= LENGTH * FEASIBLE
             if status == piqp.PIQP_SOLVED or (status == piqp.PIQP_MAX_ITER_REACHED and rounded):
                 return solver.result

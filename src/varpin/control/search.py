@@ -29,6 +29,7 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.control.qp import Minimum, Program, changes
 from varpin.control.riccati import Plan, backward, foreseen, noise_shares
 from varpin.control.rollout import around
+from varpin.control.second_order import curvature_along
 from varpin.control.sizes import FEASIBLE, HARMLESS, NOTABLE, ROUNDING, SLIGHT, TENTH, TRACE
 from varpin.control.solution import Solution
 from varpin.control.stages import Layout, Rows, Stages, Steps, states
@@ -257,7 +258,7 @@ class Search:
         if self.regularization > 0.0 and not self.second_order and self._is_saturated():
             self.second_order = True
             logger.info("%s: servos are at the limits of their drives: second derivatives from now on", self.label)
-        curvature = along.curvature(self._costates()) if self.second_order else None
+        curvature = curvature_along(along, self._costates()) if self.second_order else None
         # Within limits and rows the regularization is a cost of the quadratic program, whose model stays exact.
         plan = self._pass(0.0 if self.bound else self.regularization, curvature) or self._pass(
             self.regularization, curvature

@@ -1,6 +1,6 @@
 """What counts as nothing, as little and as much: the sizes that plans, their search and their checks share.
 
-Each is the share of a whole that is named where it is used, beside its range: within it plans stay what they are.
+Each is a share of a whole, which is named where it is used. Within the ranges plans keep their status and their cost.
 """
 
 # Rounding errors, relative to the largest of the numbers that are summed; from 1e-14 to 1e-10.
@@ -9,7 +9,7 @@ ROUNDING = 1e-12
 HARMLESS = 1e-9
 # Shares that are none: interior points end inside their bounds, and iterations leave that much; from 1e-7 to 1e-5.
 TRACE = 1e-6
-# Greatest violation of a constraint at its places in a feasible plan, in its own unit; from 1e-8 to 1e-5.
+# Greatest violation of a constraint at its places in a feasible plan, in its own unit; from 1e-7 to 1e-5.
 FEASIBLE = 1e-6
 # Changes that matter little: motions are looked at between nodes, margins follow; from 1e-4 to 1e-2.
 SLIGHT = 1e-3

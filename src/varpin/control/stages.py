@@ -19,13 +19,7 @@ from varpin.control.constraints import BoundConstraint, BoundRate
 from varpin.control.costs import CostError, Expansion
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.samples import after_impulse, at_samples, beyond_samples
-from varpin.linearization import (
-    Linearization,
-    linearize_steps,
-    second_order_steps,
-    velocity_at_nodes,
-    velocity_curvature,
-)
+from varpin.linearization import Linearization, linearize_steps, velocity_at_nodes
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
 
@@ -225,35 +219,6 @@ class Steps:
         weighted = (spread @ self.Gz.reshape(N, x, k * Z)).reshape(N, x * k, Z)
         gradient = (np.swapaxes(weighted, 1, 2) @ self.lin.G.reshape(N, x * k, 1))[:, :, 0]
         return gradient, np.swapaxes(self.Gz.reshape(N, x * k, Z), 1, 2) @ weighted
-
-    def curvature(self, costate: Floats) -> Floats:
-        """Second derivatives of the steps (N, Z, Z) in the cost to go, whose slopes are ``costate`` (N, 2n) after each.
-
-        Of linear controls they are those in their mean over the step, exact for one stage; the rest is of higher order.
-        """
-        problem, motion = self.problem, self.trajectory
-        scene, n, rule, N = problem.scene, problem.scene.robot.dof, problem.rule, problem.steps
-        gradient = self.running.gradient.reshape(N, len(rule), -1)
-        # The running cost's gradient in v0, q1 and v1 of each step.
-        v0, q1, v1 = (
-            problem.dt * rule[0, 0] * (rule[:, 1 + c] @ gradient[:, :, :n] + rule[:, 5 + c] @ gradient[:, :, n : 2 * n])
-            for c in (1, 2, 3)
-        )
-        z = costate.copy()
-        z[:, :n] += q1
-        z += np.einsum("Ni,Nix->Nx", v1, self.slopes[1:, n:])
-        second = second_order_steps(scene, motion, z, problem.integrator)
-        ux, uu = second.ux, second.uu
-        if problem.linear:
-            late = np.full(scene.controls, 0.5)
-            late[scene.prescribed] = 1.0  # inputs are where they lead to
-            ends = np.vstack([np.diag(1.0 - late), np.diag(late)])
-            ux, uu = ends @ ux, ends @ uu @ ends.T
-        total = np.block([[second.xx, np.swapaxes(ux, 1, 2)], [ux, uu]])
-        total[:, : 2 * n, : 2 * n] += velocity_curvature(scene, motion.q[:-1], motion.v[:-1], v0)
-        after = velocity_curvature(scene, motion.q[1:], motion.v[1:], v1)
-        found: Floats = total + np.swapaxes(self.J, 1, 2) @ after @ self.J
-        return found
 
     def closed(self, feedback: Feedback, *, halves: bool = False) -> Floats:
         """Matrices (N, Z, Z) to the variables of each step, from the state before it and the controls of the last one.

@@ -12,7 +12,15 @@ from varpin.control.constraints.base import LENGTH, BoundConstraint, Horizon, Pl
 from varpin.errors import InputError
 from varpin.model import Robot, joint_unit, require_robot
 from varpin.model.kinematics import require_same
-from varpin.support.checks import JointValues, as_floats, control_array, control_values, real, some_limits
+from varpin.support.checks import (
+    JointValues,
+    as_floats,
+    broadcast_array,
+    control_array,
+    control_values,
+    real,
+    some_limits,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +164,7 @@ class WithinControlRate(PlanConstraint):
         if isinstance(self.limit, Mapping):
             limit = control_array(f"{name} limit", self.limit, joints, absent=np.inf)
         else:
-            limit = np.asarray(self.limit)
-            if limit.shape not in ((), (m,)):
-                raise InputError(f"{name} limit must be one number or have shape ({m},), got {limit.shape}")
-            limit = np.array(np.broadcast_to(limit, (m,)))
+            limit = broadcast_array(f"{name} limit", self.limit, m, limit=True)
         if not np.isfinite(limit).any():
             raise InputError(f"{name} limit must be finite for some control")
         before = horizon.before
