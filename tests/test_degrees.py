@@ -7,7 +7,7 @@ import logging
 import numpy as np
 import pinocchio as pin
 import pytest
-from refusals import refused, unnamed
+from refusals import naming, refused, unnamed
 
 import varpin as vp
 from varpin.cli import main
@@ -78,6 +78,11 @@ def test_a_plan_names_units_before_everything_else(scene):
         problem = vp.OptimalControlProblem(scene, cost, np.zeros(6), np.zeros(6), dt=0.05, steps=4)
         plan = vp.solve(problem, max_iterations=2)
         assert any(not unnamed(warning, FACTS) for warning in plan.warnings) == told
+        for reference in (goal, [goal] * 5, lambda t, goal=goal: goal):
+            along = problem.at(cost=vp.ControlCost(1e-3) + vp.TrackingCost(reference))
+            assert any(not unnamed(warning, FACTS) for warning in foreseen(along)) == told
+    cost = vp.ControlCost(1e-3) + vp.FramePositionCost(scene.robot, "tool0", lambda t: [400.0, 100.0, 500.0])
+    assert not unnamed(foreseen(problem.at(cost=cost))[0], ("'tool0'", "millimetres"))
     problem = vp.OptimalControlProblem(scene, vp.ControlCost(1e-3), HOME, np.zeros(6), dt=0.05, steps=4)
     assert not unnamed(vp.solve(problem).warnings[0], FACTS)
 
@@ -111,6 +116,24 @@ def test_other_positions_in_degrees(scene, caplog):
     closed = vp.Scene(scene.robot, constraints=[vp.PointOnPoint("tool0", [0.8, 0.1, 0.2])])
     with refused(vp.InputError, "q0", *FACTS):
         vp.simulate(closed, HOME, np.zeros(6), dt=1e-3, steps=2)
+
+
+@pytest.mark.parametrize(
+    ("load", "facts"),
+    [
+        (
+            lambda k: vp.load_robot("ur5", payload=vp.Payload("tool0", 2.0, [0.0, 0.0, k * 0.25])),
+            ("payload", "'tool0'"),
+        ),
+        (lambda k: vp.load_robot("ur5", payload=vp.Payload("tool0", k * 2.0)), ("2000 kg", "grams")),
+        (lambda k: vp.planar_chain(2, length=k * 0.5), ("'joint1' and 'joint2'", "500 m", "millimetres")),
+    ],
+)
+def test_sizes_in_millimetres_and_grams(load, facts, caplog):
+    load(1.0)
+    assert not caplog.records
+    load(1000.0)
+    assert len(naming(caplog.messages, facts)) == 1
 
 
 def test_stops_in_degrees(caplog):
