@@ -198,3 +198,32 @@ def test_millimetres_in_obstacles_and_regions(scene, make, named, scale):
     told = naming(planned(scene, np.deg2rad(HOME), REST, make(scene.robot, scale)), "millimetres")
     assert told == naming(told, named)
     assert bool(told) == (scale > 1.0)
+
+
+def test_references_along_a_plan_are_looked_at_too(scene):
+    goal, cost = np.array([0.0, -90.0, 90.0, 0.0, 45.0, 0.0]), vp.ControlCost(1e-3)
+    problem = vp.OptimalControlProblem(scene, cost, REST, REST, dt=0.05, steps=4)
+    for scale, told in ((1.0, True), (np.pi / 180.0, False)):
+        for reference in (scale * goal, [scale * goal] * 5, lambda t, goal=scale * goal: goal):
+            found = foreseen(problem.at(cost=cost + vp.TrackingCost(reference)))
+            assert any(not unnamed(warning, FACTS) for warning in found) == told
+    place = vp.FramePositionCost(scene.robot, "tool0", lambda t: [400.0, 100.0, 500.0])
+    assert not unnamed(foreseen(problem.at(cost=cost + place))[0], ("'tool0'", "millimetres"))
+
+
+@pytest.mark.parametrize(
+    ("load", "facts"),
+    [
+        (
+            lambda k: vp.load_robot("ur5", payload=vp.Payload("tool0", 2.0, [0.0, 0.0, k * 0.25])),
+            ("payload", "'tool0'"),
+        ),
+        (lambda k: vp.load_robot("ur5", payload=vp.Payload("tool0", k * 2.0)), ("2000 kg", "grams")),
+        (lambda k: vp.planar_chain(2, length=k * 0.5), ("'joint1' and 'joint2'", "500 m", "millimetres")),
+    ],
+)
+def test_sizes_in_millimetres_and_grams(load, facts, caplog):
+    load(1.0)
+    assert not caplog.records
+    load(1000.0)
+    assert len(naming(caplog.messages, facts)) == 1

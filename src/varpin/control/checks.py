@@ -6,13 +6,13 @@ import itertools
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.constraints import KeepInBox, ReachFrame, WithinJointLimits
-from varpin.control.costs import FramePositionCost, TrackingCost, weight_matrix
+from varpin.control.costs import TrackingCost
+from varpin.control.costs.base import BoundTerm
 from varpin.control.margins import too_small
 from varpin.control.noise import covariances, noise_cost
 from varpin.control.problem import OptimalControlProblem
@@ -20,6 +20,7 @@ from varpin.control.sizes import FEASIBLE, HARMLESS, NOTABLE, SLIGHT, TRACE
 from varpin.control.solution import Solution
 from varpin.control.stages import Feedback, Steps
 from varpin.control.verification import Played, at_start, excess, in_parts, percent, replays
+from varpin.core import Subject
 from varpin.errors import VarpinError
 from varpin.finding import Finding, announce, ranked
 from varpin.mechanics.forces import of_kind
@@ -35,7 +36,7 @@ from varpin.model import (
     looks_like_degrees,
     millimetres_hint,
 )
-from varpin.model.kinematics import frame_kinematics, reach
+from varpin.model.kinematics import FrameKinematics, reach
 from varpin.simulation.check import check
 from varpin.simulation.record import rollout
 from varpin.simulation.start import in_other_units
@@ -119,19 +120,18 @@ def _starts_outside(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Goals and targets that their frame cannot reach."""
-    robot, places = problem.scene.robot, list[tuple[str, str, Floats, Any]]()
-    for term in problem.cost.terms:
-        if isinstance(term, FramePositionCost) and not callable(term.target):
-            strengths, axes = np.linalg.eigh(weight_matrix("FramePositionCost", term.weight, 3))
+    robot, places = problem.scene.robot, list[tuple[str, FrameKinematics, Floats, Floats]]()
+    for term in _terms(problem):
+        if term.subject == Subject.position and isinstance(term.of, FrameKinematics):
+            strengths, axes = np.linalg.eigh(term.weight)
             weighed = axes[:, strengths > TRACE * strengths[-1]]
-            places.append((f"FramePositionCost({term.frame!r})", term.frame, weighed, term.target))
+            places.append((f"FramePositionCost({term.of.frame!r})", term.of, weighed, term.target))
     for goal in problem.constraints:
         if isinstance(goal, ReachFrame) and goal.position is not None:
-            places.append((goal.label, goal.frame, np.eye(3), goal.position))
-    for label, frame, axes, place in places:
-        kinematics = frame_kinematics(robot, frame)
+            places.append((goal.label, goal.kinematics, np.eye(3), goal.position[None]))
+    for label, kinematics, axes, place in places:
         most, root = reach(robot, kinematics), kinematics.links.tree.translation[0]
-        away = float(np.linalg.norm((np.atleast_2d(place) - root) @ axes, axis=1).max())
+        away = float(np.linalg.norm((place - root) @ axes, axis=1).max())
         if away > most * (1.0 + TRACE):
             far = away > AFAR * most
             sentence = (
@@ -139,6 +139,13 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
                 f"at most: {IN_MILLIMETRES if far else 'no motion gets there'}"
             )
             yield Finding("goal in millimetres" if far else "goal out of reach", sentence)
+
+
+def _terms(problem: OptimalControlProblem) -> Iterator[BoundTerm]:
+    """The terms of the cost that the core evaluates, with their targets at the samples."""
+    for _, part in (*problem.running.parts, *problem.terminal.parts):
+        if isinstance(part, BoundTerm):
+            yield part
 
 
 def _postures(problem: OptimalControlProblem) -> Iterator[Floats]:
@@ -185,11 +192,13 @@ def _weights(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 
 def _in_degrees(problem: OptimalControlProblem) -> Iterator[Finding]:
-    """Goal configurations and limits of joints that look like degrees."""
+    """Goals, references and limits of joints that look like degrees."""
     robot = problem.scene.robot
-    for end in _postures(problem):
-        if sentence := degrees_hint(robot, "the goal of the terminal TrackingCost", end):
-            yield Finding("goal in degrees", sentence)
+    for term in _terms(problem):
+        if term.subject == Subject.entries and term.of == 0:
+            most = np.take_along_axis(term.target, np.abs(term.target).argmax(axis=0)[None], axis=0)[0]
+            if sentence := degrees_hint(robot, "the reference of a TrackingCost", most):
+                yield Finding("goal in degrees", sentence)
     for own in problem.constraints:
         if not isinstance(own, WithinJointLimits):
             continue

@@ -19,7 +19,7 @@ from varpin.model.mimic import joint_index
 from varpin.model.robot import Robot, check_inertia, limits_of
 from varpin.model.sources import describe
 from varpin.model.tree import is_unbounded, joint_axis
-from varpin.model.units import ADVICE, looks_like_degrees
+from varpin.model.units import ADVICE, looks_like_degrees, odd_sizes
 from varpin.support.checks import (
     JointValues,
     as_floats,
@@ -131,11 +131,13 @@ def unchecked_robot(
     if inertia == "meshes":
         robot = with_mesh_inertias(robot, density)
     robot = _on_base(robot, base)
-    carry(robot.model, tuple_of("payload", payload, Payload), robot.name)
+    payload = tuple_of("payload", payload, Payload)
+    carry(robot.model, payload, robot.name)
     names = list(robot.model.names)
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise RobotError(f"robot {robot.name!r} has several joints named {', '.join(map(repr, twice))}")
     robot = hold_joints(robot, _locks(robot, lock, keep))
+    robot = robot.changed(faults=(*robot.faults, *odd_sizes(robot, payload)))
     return robot if armature is None else _with_rotors(robot, armature)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats
 
 if TYPE_CHECKING:
+    from varpin.model.inertia import Payload
     from varpin.model.robot import Robot
 
 # Largest plausible angle [rad]: two turns.
@@ -29,6 +30,8 @@ AFAR = 50.0
 ASIDE = 2.0
 # Least reach that counts [m]: a wheel has none.
 _LEAST = 0.1
+# Longest plausible link [m], and largest plausible payload in masses of the robot: arms carry about their own mass.
+_LONG, _BURDEN = 50.0, 10.0
 IN_MILLIMETRES = "it may be in millimetres, and lengths are in metres"
 
 
@@ -89,6 +92,25 @@ def longest_reach(robot: Robot, *, slides: bool = True, centers: bool = True) ->
             ends = np.array([lower[tree.coordinate[body]], upper[tree.coordinate[body]]])
             path[body] += float(np.abs(tree.ratio[body] * ends + tree.offset[body]).max())
     return float((path + (np.linalg.norm(tree.center, axis=1) if centers else 0.0)).max())
+
+
+def odd_sizes(robot: Robot, payload: Iterable[Payload]) -> Iterator[str]:
+    """Sentences about links and payloads whose sizes look like millimetres or grams."""
+    tree, names = robot.tree, robot.model.names
+    hops = np.where(tree.parent >= 0, np.linalg.norm(tree.translation, axis=1), 0.0)
+    body, carried = int(np.argmax(hops)), tuple(payload)
+    if hops[body] > _LONG:
+        joints = f"{names[int(tree.parent[body]) + 1]!r} and {names[body + 1]!r}"
+        yield f"the link between joints {joints} is {hops[body]:.4g} m long: {IN_MILLIMETRES}"
+    span = max(longest_reach(robot, centers=False), _LEAST)
+    mass = float(tree.mass.sum()) - sum(part.mass for part in carried)
+    for part in carried:
+        away = float(np.linalg.norm(part.center))
+        if away > AFAR * span:
+            yield f"the payload has its centre {away:.4g} m from frame {part.frame!r}: {IN_MILLIMETRES}"
+        if part.mass > _BURDEN * mass > 0.0:
+            heavy = f"the payload at frame {part.frame!r} weighs {part.mass:.4g} kg, and the robot {mass:.3g} kg"
+            yield f"{heavy}: it may be in grams, and masses are in kg"
 
 
 def millimetres_hint(robot: Robot, lengths: dict[str, float], plausible: float = AFAR) -> str:
