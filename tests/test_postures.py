@@ -94,6 +94,7 @@ def test_names_and_files_that_are_not_there(urdf):
         ("srdf/made_up.srdf", "another", True),
         ("srdf/any.srdf", "made_up", True),
         ("srdf/any.srdf", "another", False),
+        ("srdf/one.srdf srdf/two.srdf", "made_up", False),
         ("deep/srdf/made_up.srdf", "made_up", False),
     ],
 )
@@ -101,9 +102,10 @@ def test_where_the_file_is_looked_for(urdf, tmp_path, place, name, found):
     folder = tmp_path / "urdf"
     folder.mkdir()
     urdf = urdf.rename(folder / urdf.name)
-    file = tmp_path / place.format("urdf")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(SRDF.replace("made_up", name))
+    for each in place.format("urdf").split():
+        file = tmp_path / each
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(SRDF.replace("made_up", name))
     assert bool(vp.load_robot(urdf).postures) == found
     assert vp.load_robot(urdf, srdf=str(file)).postures == ("home", "there")
 
