@@ -19,7 +19,6 @@ from typing import Any
 
 import cloudpickle
 import numpy as np
-import pinocchio as pin
 from numpy.polynomial.legendre import legvander
 
 from varpin.arrays import Floats, Integers
@@ -75,7 +74,7 @@ class KeptLaw:
     """A control law as it was when it was kept, with all that it changes when it is called.
 
     Copies are by value, as of functions that are sent to other processes: calls of a copy change nothing of the user's.
-    Frozen objects, and models and data of Pinocchio, are shared.
+    Frozen objects, and those of Pinocchio, are shared.
     """
 
     class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
@@ -84,7 +83,7 @@ class KeptLaw:
             self._shared = shared
 
         def persistent_id(self, value: object) -> int | None:
-            if not isinstance(value, Frozen | pin.Model | pin.Data):
+            if not (isinstance(value, Frozen) or type(value).__module__.startswith("pinocchio")):
                 return None
             self._shared.append(value)
             return len(self._shared) - 1
