@@ -81,6 +81,8 @@ def test_margins_in_standard_deviations(name):
     if problem.scene.robot.dof > 2:
         return
     assert share >= 0.5 * ndtr(-2.0)
+    # With their margins, values are at the bound.
+    assert plan.constraints[0].values.max() == pytest.approx(0.0, abs=1e-6)
     # Without noise the plan keeps away from the bound.
     assert (problem.constraints[0].limits[1] - plan.trajectory.q).min() > 1e-3
 

@@ -34,6 +34,7 @@ def test_plan(name):
     assert ((problem.control_limits[0] <= plan.controls) & (plan.controls <= problem.control_limits[1])).all()
     assert violation(problem, plan.trajectory, plan.controls) <= MET
     assert plan.violation <= MET
+    assert all((np.diff(report.t) >= 0.0).all() for report in plan.constraints)
     # The motion is that of its policy, and for arms that do not fall over without feedback, of its controls.
     assert_allclose(problem.simulate(plan.policy).q, plan.trajectory.q, rtol=0, atol=1e-9)
     if name in SMALL and not problem.scene.constraints:
