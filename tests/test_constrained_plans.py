@@ -16,7 +16,6 @@ ROW = np.array([[1.0, -1.5, 0.5]])
 
 
 def rails():
-    """Three masses on rails with springs and dampers, one linear constraint, and two forces."""
     model = pin.Model()
     for k, mass in enumerate(MASSES):
         place = pin.SE3(np.eye(3), np.array([0.0, float(k), 0.0]))
