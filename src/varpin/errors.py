@@ -131,7 +131,8 @@ class UnknownName(InputError):
 
     def __init__(self, name: str, known: Iterable[str], lack: str) -> None:
         self.name, self.known = name, tuple(known)
-        self.matches = difflib.get_close_matches(name, self.known, n=3, cutoff=0.5)
+        within = [other for other in self.known if name and name in other]
+        self.matches = difflib.get_close_matches(name, self.known, n=3, cutoff=0.5) or within[:3]
         hint = f"did you mean {' or '.join(map(repr, self.matches))}? " if self.matches else ""
         more = f" and {len(self.known) - _MOST_NAMES} more" if self.known[_MOST_NAMES:] else ""
         names = ", ".join(self.known[:_MOST_NAMES]) or "none"

@@ -113,7 +113,7 @@ def _starts_outside(problem: OptimalControlProblem) -> Iterator[Finding]:
         if c is not None and c[row := int(np.argmax(c))] > NOTABLE * bound.scale:
             sentence = (
                 f"the start is outside {problem.label_of(bound.source)}, {bound.rows[row]} by {c[row]:.2g} "
-                f"{bound.unit}, and the first node has to be inside: begin inside, or widen the bound"
+                f"{bound.unit}, and the first node after it has to be inside: begin inside, or widen the bound"
             )
             yield Finding("start outside constraints", sentence, time=0.0, value=float(c[row]), unit=bound.unit)
 

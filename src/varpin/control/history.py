@@ -16,9 +16,8 @@ class Status(Enum):
         "not converged: more iterations may help; continue from this solution with solve(problem, resume=solution)"
     )
     STALLED = (
-        "not converged: no step along the plan lowers the expected cost by more than the tolerance; if the expected "
-        "decrease is small, the plan is close to an optimum; else a smaller dt, other first controls, correct "
-        "derivatives of a custom cost or a higher cost of the controls may help"
+        "not converged: no step lowers the expected cost; a smaller dt, another start (controls=, states=), a wider "
+        "dry friction (CoulombFriction(width=)) or a higher cost of the controls may help"
     )
     INDEFINITE = (
         "not converged: the model of the cost has no minimum in a control, whatever the regularization; give every "
@@ -29,8 +28,8 @@ class Status(Enum):
         "says where. A smaller dt, or a cost that is finite around the motion, may help"
     )
     INFEASIBLE = (
-        "infeasible: a constraint cannot be met from the first controls, and plan.reason names it. Other first "
-        "controls may lead around an obstacle; a longer horizon, wider limits or another goal may help"
+        "infeasible: plan.reason names the constraint; a start that leads around an obstacle (states=), a smaller dt, "
+        "a wider dry friction (CoulombFriction(width=)), a longer horizon or wider limits may help"
     )
     OUT_OF_TIME = "stopped at the time limit: this is the best motion so far"
     INTERRUPTED = "interrupted: this is the best motion so far"

@@ -287,9 +287,10 @@ class LinearPolicy(Frozen):
             InputError: The policy has another number of steps, controls or coordinates, another dt, or the other x.
         """
         if self.on is not None and variational != (self.on == "momentum"):
+            other = "RungeKutta4()" if variational else "Gauss(2)"
             raise InputError(
                 f"the policy acts on (q, {'p' if self.on == 'momentum' else 'v'}), the integrator's state is "
-                f"(q, {'p' if variational else 'v'}); Solution.policy_on(...) gives the policy on either"
+                f"(q, {'p' if variational else 'v'}); take integrator=varpin.{other}, or a plan's Solution.policy_on(...)"
             )
         hold, intervals = self.hold if dt is None else self.hold_at(dt), len(self.gains)
         if intervals * hold != steps:
