@@ -290,7 +290,7 @@ class LinearPolicy(Frozen):
             other = "RungeKutta4()" if variational else "Gauss(2)"
             raise InputError(
                 f"the policy acts on (q, {'p' if self.on == 'momentum' else 'v'}), the integrator's state is "
-                f"(q, {'p' if variational else 'v'}); take integrator=varpin.{other}, or a plan's Solution.policy_on(...)"
+                f"(q, {'p' if variational else 'v'}); take integrator=varpin.{other}, or plan.policy_on(...)"
             )
         hold, intervals = self.hold if dt is None else self.hold_at(dt), len(self.gains)
         if intervals * hold != steps:
