@@ -81,8 +81,6 @@ def test_a_plan_names_units_before_everything_else(scene):
         for reference in (goal, [goal] * 5, lambda t, goal=goal: goal):
             along = problem.at(cost=vp.ControlCost(1e-3) + vp.TrackingCost(reference))
             assert any(not unnamed(warning, FACTS) for warning in foreseen(along)) == told
-    cost = vp.ControlCost(1e-3) + vp.FramePositionCost(scene.robot, "tool0", lambda t: [400.0, 100.0, 500.0])
-    assert not unnamed(foreseen(problem.at(cost=cost))[0], ("'tool0'", "millimetres"))
     problem = vp.OptimalControlProblem(scene, vp.ControlCost(1e-3), HOME, np.zeros(6), dt=0.05, steps=4)
     assert not unnamed(vp.solve(problem).warnings[0], FACTS)
 
@@ -162,9 +160,11 @@ def test_stops_in_degrees(caplog):
         ),
         (
             lambda r, k: vp.KeepOutOfSphere(r, "tool0", k * np.array([0.9, 0.3, 0.4]), 0.1),
-            "KeepOutOfSphere: the distance",
+            ("KeepOutOfSphere('tool0')", "distance"),
         ),
-        (lambda r, k: vp.KeepInHalfSpace(r, "tool0", [0.0, 0.0, 1.0], k * -0.3), "KeepInHalfSpace: offset"),
+        (lambda r, k: vp.KeepInHalfSpace(r, "tool0", [0.0, 0.0, 1.0], k * -0.3), "KeepInHalfSpace('tool0')"),
+        (lambda r, k: vp.KeepInBox(r, "tool0", k * np.array([-0.9, -0.8, 0.1]), np.inf), "KeepInBox('tool0')"),
+        (lambda r, k: vp.KeepInSphere(r, "tool0", [0.1, 0.2, 0.3], k * 0.6), "KeepInSphere('tool0')"),
     ],
 )
 def test_millimetres_in_obstacles_and_regions(scene, make, named, scale):

@@ -10,17 +10,9 @@ from dataclasses import replace
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.constraints import (
-    KeepClear,
-    KeepInBox,
-    KeepInHalfSpace,
-    KeepInSphere,
-    KeepOutOfSphere,
-    PlanConstraint,
-    ReachFrame,
-    WithinJointLimits,
-)
-from varpin.control.costs import TrackingCost
+from varpin.control.constraints import KeepClear, ReachFrame, WithinJointLimits
+from varpin.control.constraints.frames import BoundRegion
+from varpin.control.costs import FramePositionCost, TrackingCost, weight_matrix
 from varpin.control.costs.base import BoundTerm
 from varpin.control.margins import too_small
 from varpin.control.multipliers import FEASIBLE, REPORTED
@@ -46,7 +38,7 @@ from varpin.model import (
     looks_like_degrees,
     millimetres_hint,
 )
-from varpin.model.kinematics import FrameKinematics
+from varpin.model.kinematics import FrameKinematics, frame_kinematics
 from varpin.simulation.check import check
 from varpin.simulation.record import rollout
 from varpin.simulation.start import in_other_units
@@ -136,11 +128,12 @@ def _starts_outside(problem: OptimalControlProblem) -> Iterator[Finding]:
 def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Goals and targets that their frame cannot reach."""
     robot, places = problem.scene.robot, list[tuple[str, FrameKinematics, Floats, Floats]]()
-    for term in _terms(problem):
-        if term.subject == Subject.position and isinstance(term.of, FrameKinematics):
-            strengths, axes = np.linalg.eigh(term.weight)
+    for term in problem.cost.terms:
+        if isinstance(term, FramePositionCost) and not callable(term.target):
+            strengths, axes = np.linalg.eigh(weight_matrix("FramePositionCost", term.weight, 3))
             weighed = axes[:, strengths > FEASIBLE * strengths[-1]]
-            places.append((f"FramePositionCost({term.of.frame!r})", term.of, weighed, term.target))
+            kinematics = frame_kinematics(robot, term.frame)
+            places.append((f"FramePositionCost({term.frame!r})", kinematics, weighed, np.atleast_2d(term.target)))
     for goal in problem.constraints:
         if isinstance(goal, ReachFrame) and goal.position is not None:
             places.append((goal.label, goal.kinematics, np.eye(3), goal.position[None]))
@@ -176,13 +169,6 @@ def reach(robot: Robot, frame: FrameKinematics) -> float:
             ways.append(most[k - 1] + slides[k - 1] + np.hypot(across, before[2] + hop[2]))
         most.append(float(min(ways)))
     return most[-1]
-
-
-def _terms(problem: OptimalControlProblem) -> Iterator[BoundTerm]:
-    """The terms of the cost that the core evaluates, with their targets at the samples."""
-    for _, part in (*problem.running.parts, *problem.terminal.parts):
-        if isinstance(part, BoundTerm):
-            yield part
 
 
 def _postures(problem: OptimalControlProblem) -> Iterator[Floats]:
@@ -233,8 +219,8 @@ def _weights(problem: OptimalControlProblem) -> Iterator[Finding]:
 def _in_degrees(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Goals, references and limits of joints that look like degrees."""
     robot = problem.scene.robot
-    for term in _terms(problem):
-        if term.subject == Subject.entries and term.of == 0:
+    for _, term in (*problem.running.parts, *problem.terminal.parts):
+        if isinstance(term, BoundTerm) and term.subject == Subject.entries and term.of == 0:
             most = np.take_along_axis(term.target, np.abs(term.target).argmax(axis=0)[None], axis=0)[0]
             if sentence := degrees_hint(robot, "the reference of a TrackingCost", most):
                 yield Finding("goal in degrees", sentence)
@@ -252,35 +238,28 @@ def _in_degrees(problem: OptimalControlProblem) -> Iterator[Finding]:
 def _in_millimetres(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Obstacles and regions whose places or sizes look like millimetres."""
     robot = problem.scene.robot
-    for constraint in problem.constraints:
-        lengths = {f"{type(constraint).__name__}: {name}": size for name, size in _lengths(constraint).items()}
-        sentence = millimetres_hint(robot, lengths) if lengths else ""
-        if isinstance(constraint, KeepClear) and not sentence:
+    for bound in problem.bound_constraints:
+        constraint, sentence, lengths = bound.source, "", dict[str, float]()
+        if isinstance(bound, BoundRegion):
+            # One far side of a box may stand for none.
+            lengths["its distance from the first joint"] = float(np.abs(bound.outside(robot.tree.translation[0])).min())
+        if isinstance(constraint, KeepClear):
+            lengths = _sizes(constraint)
             sentence = millimetres_hint(robot, {"KeepClear: distance": abs(constraint.distance)}, ASIDE)
+        if lengths:
+            sentence = millimetres_hint(robot, {f"{constraint.label}: {k}": x for k, x in lengths.items()}) or sentence
         if sentence:
             yield Finding("places in millimetres", sentence)
 
 
-def _lengths(constraint: PlanConstraint) -> dict[str, float]:
-    """Names of a constraint's lengths, and their sizes [m]; places count by their distance from the robot's root."""
+def _sizes(constraint: KeepClear) -> dict[str, float]:
+    """Names of the lengths of obstacles, and their sizes [m]; places count by their distance from the first joint."""
     found: dict[str, float] = {}
-    if isinstance(constraint, KeepInSphere | KeepOutOfSphere):
-        found["radius"] = constraint.radius
-        if not callable(constraint.center):
-            root = constraint.robot.tree.translation[0]
-            found["the distance of its centre"] = float(np.linalg.norm(constraint.center - root))
-    elif isinstance(constraint, KeepInHalfSpace):
-        found["offset"] = abs(constraint.offset)
-    elif isinstance(constraint, KeepInBox):
-        # One far side may stand for none.
-        away = np.abs(constraint.limits[np.isfinite(constraint.limits)])
-        found["its nearest side"] = float(away[away > 0.0].min(initial=np.inf)) if away.any() else 0.0
-    elif isinstance(constraint, KeepClear):
-        for body in constraint.obstacles:
-            ends, sides = np.array([body.begin, body.end]), body.sides if body.hull is None else body.hull.sides
-            distances = np.linalg.norm(ends - constraint.robot.tree.translation[0], axis=1)
-            found[f"the obstacle {body.name!r}: its distance"] = float(distances.min())
-            found[f"the obstacle {body.name!r}: its radius or side"] = body.radius if sides is None else sides.max()
+    for body in constraint.obstacles:
+        ends, sides = np.array([body.begin, body.end]), body.sides if body.hull is None else body.hull.sides
+        distances = np.linalg.norm(ends - constraint.robot.tree.translation[0], axis=1)
+        found[f"the obstacle {body.name!r}: its distance"] = float(distances.min())
+        found[f"the obstacle {body.name!r}: its radius or side"] = body.radius if sides is None else sides.max()
     return found
 
 
