@@ -192,6 +192,8 @@ def ball(r, at, distance):
         (lambda r, k: ball(r, [2.0, 0.5, 0.4], k * 0.1), ("KeepClear", "distance")),
         (lambda r, k: vp.KeepOutOfSphere(r, "tool0", k * np.array([0.9, 0.3, 0.4]), 0.1), "KeepOutOfSphere"),
         (lambda r, k: vp.KeepInHalfSpace(r, "tool0", [0.0, 0.0, 1.0], k * -0.3), "KeepInHalfSpace"),
+        (lambda r, k: vp.KeepInBox(r, "tool0", k * np.array([-0.9, -0.8, 0.1]), np.inf), "KeepInBox('tool0')"),
+        (lambda r, k: vp.KeepInSphere(r, "tool0", [0.1, 0.2, 0.3], k * 0.6), "KeepInSphere('tool0')"),
     ],
 )
 def test_millimetres_in_obstacles_and_regions(scene, make, named, scale):

@@ -19,6 +19,7 @@ from varpin.integrators.registry import require_motion, require_scene_of
 from varpin.mechanics.noise import Fields
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.signals.commands import open_line, open_loop
+from varpin.simulation.choice import given_integrator
 from varpin.simulation.velocity_noise import wrong_spread
 from varpin.support.checks import as_floats, finite_array
 from varpin.support.differences import slopes
@@ -375,10 +376,9 @@ def _integrator_of(scene: Scene, trajectory: Trajectory, given: Integrator | Non
     linear = trajectory.u_nodes.shape[1] > 0
     if trajectory.dw.shape[1] not in (scene.processes, scene.increments(linear=linear)):
         raise InputError(f"the trajectory has {trajectory.dw.shape[1]} processes, the scene {scene.processes}")
-    if given is not None and not isinstance(given, Integrator):
-        raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {given!r}")
-    if given is not None and str(given) == trajectory.integrator:
-        return given
+    chosen = given_integrator(given)
+    if chosen is not None and str(chosen) == trajectory.integrator:
+        return chosen
     try:
         made = integrator_of(trajectory.integrator)
     except InputError as problem:

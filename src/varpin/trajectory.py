@@ -419,12 +419,12 @@ def require_trajectory(motion: object) -> Trajectory:
 def kinematic_input_rows(trajectory: Trajectory) -> Integers:
     """Rows (joint, joint, rate) of a record's ties that are kinematic inputs: joints tied to themselves."""
     ties = scene_indices(trajectory, "constraints.ties", 3)
-    own: Integers = ties[ties[:, 0] == ties[:, 1]]
-    return own
+    return np.asarray(ties[ties[:, 0] == ties[:, 1]], dtype=np.int64)
 
 
 def scene_indices(trajectory: Trajectory, kind: str, columns: int) -> Integers:
     """The indices (K, columns) with which a record's rows of a kind begin; a file may have other numbers there."""
     rows = trajectory.scene_values.get(kind, np.zeros(0))
     found = rows[:, :columns] if rows.ndim == 2 and rows.shape[1] >= columns else np.zeros((0, columns))
-    return found[(np.abs(found) < sys.maxsize).all(axis=1)].astype(np.int64)
+    indices: Integers = found[(np.abs(found) < sys.maxsize).all(axis=1)].astype(np.int64)
+    return indices

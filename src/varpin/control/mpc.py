@@ -30,7 +30,7 @@ from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import generator
 from varpin.signals.commands import in_parts_of_steps, with_ends
 from varpin.simulation.check import check
-from varpin.simulation.choice import usual_integrator
+from varpin.simulation.choice import given_integrator, usual_integrator
 from varpin.simulation.failures import Interrupted, StepFailure
 from varpin.simulation.limits import beyond_limits
 from varpin.simulation.loop import unstable_loop
@@ -65,8 +65,7 @@ class Plant:
 
     def __post_init__(self) -> None:
         require_scene(self.scene)
-        if self.integrator is not None and not isinstance(self.integrator, Integrator):
-            raise InputError(f"integrator must be one of varpin's, got {self.integrator!r}")
+        given_integrator(self.integrator)
         count("substeps", self.substeps, least=1)
 
 

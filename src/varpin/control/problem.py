@@ -35,7 +35,7 @@ from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene, closest_controls, require_scene, same, tangent_basis
 from varpin.signals.commands import as_moved, cubics
 from varpin.signals.policy import LinearPolicy, OpenLoop
-from varpin.simulation.choice import integrator_for
+from varpin.simulation.choice import given_integrator, integrator_for
 from varpin.simulation.simulate import simulate
 from varpin.simulation.spectrum import natural_rate
 from varpin.simulation.start import on_constraints, time_steps
@@ -168,8 +168,7 @@ class OptimalControlProblem(Frozen):
         n, m = require_scene(scene).robot.dof, scene.controls
         if not isinstance(cost, Cost):
             raise InputError(f"cost must be a cost, for example varpin.TrackingCost(...), got {type(cost).__name__}")
-        if integrator is not None and not isinstance(integrator, Integrator):
-            raise InputError(f"integrator must be one of varpin's, for example varpin.Gauss(4), got {integrator!r}")
+        given_integrator(integrator)
         if m == 0:
             raise InputError("the scene has no controls, so there is nothing to optimize")
         dt, steps = time_steps(dt, steps, duration)

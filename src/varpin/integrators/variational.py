@@ -33,7 +33,7 @@ from varpin.integrators.base import (
 from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.signals.commands import cubics
-from varpin.support.checks import count, fraction, is_one_of, positive
+from varpin.support.checks import count, fraction, positive, word
 from varpin.support.differences import FOURTH, slopes
 from varpin.trajectory import Trajectory
 
@@ -112,8 +112,7 @@ class Variational(Compiled):
         if not (self.guard is None or isinstance(self.guard, Guard)):
             raise InputError(f"guard must be a varpin.Guard, or None for no guards, got {self.guard!r}")
         positive("tolerance", self.tolerance, "rounding units")
-        if not is_one_of(self.kick, ("left", "split", "held")):
-            raise InputError(f"kick must be 'left', 'split' or 'held', got {self.kick!r}")
+        word("kick", self.kick, ("left", "split", "held"))
 
     def damped(self, z: Floats) -> tuple[Floats, Floats]:
         """See :meth:`Integrator.damped`."""

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats, Integers, Mask
 from varpin.core.arrays import Coupling, Diffusion
-from varpin.errors import InputError, UnknownJoint
+from varpin.errors import InputError
 from varpin.mechanics.forces import Force, of_kind
 from varpin.mechanics.noise import BoundNoise
 from varpin.mechanics.scene import Scene
@@ -130,8 +130,7 @@ def without(scene: Scene, joints: Mapping[str, float] | Collection[str]) -> Scen
     names = scene.robot.joint_names
     held = dict(joints if isinstance(joints, Mapping) else dict.fromkeys(tuple_of("joints", joints, str), 0.0))
     for name in held:
-        if name not in names:
-            raise UnknownJoint(str(name), names, "without: the robot has no joint")
+        scene.robot.coordinate(name)
     if not held:
         return scene
     noise = scene.noise.diffusion

@@ -20,7 +20,7 @@ from varpin.model.meshes import joined, read_mesh, shape_points
 from varpin.model.robot import Robot, readable_geometry
 from varpin.model.tree import place_of_frame, z_to
 from varpin.model.urdf import read_xml
-from varpin.support.checks import finite_array, over_time, path_like, positive, rotation_matrix
+from varpin.support.checks import finite_array, over_time, path_like, positive, require_function, rotation_matrix
 from varpin.support.frozen import Frozen
 
 coal = pin.coal
@@ -133,8 +133,7 @@ class Obstacle(Frozen):
         Raises:
             InputError: ``shift`` is no function, or the obstacle moves already.
         """
-        if not callable(shift):
-            raise InputError(f"Obstacle.moving takes a function of time, got {shift!r}")
+        require_function("Obstacle.moving: shift", shift, "time")
         if self.shift is not None:
             raise InputError(f"obstacle {self.name!r} moves already: add both ways up in one function")
         return replace(self, shift=shift)

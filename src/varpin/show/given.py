@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from varpin.errors import InputError, UnknownFrame
+from varpin.errors import UnknownFrame
 from varpin.model import Robot
+from varpin.support.checks import tuple_of
 from varpin.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -33,10 +34,8 @@ def frame_names(option: str, robots: Sequence[Robot], names: bool | str | Sequen
     """The frames of each robot: of the given names those it has; for True its end effector."""
     if isinstance(names, bool | np.bool_):
         return [(robot.end_effector,) if names else () for robot in robots]
-    wanted = (names,) if isinstance(names, str) or not isinstance(names, Iterable) else tuple(names)
+    wanted = (names,) if isinstance(names, str) else tuple_of(option, names, str)
     for name in wanted:
-        if not isinstance(name, str):
-            raise InputError(f"{option} must be names of frames, got {name!r}")
         if not any(robot.model.existFrame(name) for robot in robots):
             known = dict.fromkeys(frame.name for robot in robots for frame in robot.model.frames)
             owners = ", ".join(repr(robot.name) for robot in robots)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -23,7 +23,7 @@ from varpin.simulation.failures import StepFailure
 from varpin.simulation.simulate import simulate
 from varpin.simulation.start import on_constraints
 from varpin.simulation.tolerance import ROUNDING, Trial, candidates
-from varpin.support.checks import JointValues, joint_array, positive
+from varpin.support.checks import JointValues, joint_array, positive, tuple_of
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
 
@@ -128,12 +128,8 @@ def integrators_of(scene: Scene, integrators: Sequence[Integrator] | None) -> tu
     """The integrators to compare."""
     if integrators is None:
         return candidates(scene)
-    if not isinstance(integrators, Iterable):
-        raise InputError(f"integrators must be a list of varpin's, got {integrators!r}")
-    members = tuple(integrators)
+    members = tuple_of("integrators", integrators, Integrator)
     for member in members:
-        if not isinstance(member, Integrator):
-            raise InputError(f"integrators must be varpin's, for example varpin.Midpoint(), got {member!r}")
         if scene.constraints and not member.keeps_constraints:
             raise InputError(f"{member} keeps no constraints: varpin.Midpoint() and varpin.Gauss(stages) do")
     if not members or len(set(map(repr, members))) < len(members):

@@ -17,7 +17,7 @@ from varpin.simulation.check import repeated
 from varpin.simulation.tolerance import ROUNDING, SENSIBLE, Ladder, Trial, first_steps
 from varpin.study.motion import Setting, integrators_of
 from varpin.study.record import Chart, Progress, Study, collect, pareto_front
-from varpin.support.checks import JointValues, count, positive
+from varpin.support.checks import JointValues, count, positive, word
 
 Quantity = Literal["q", "energy"]
 
@@ -111,8 +111,7 @@ class WorkPrecision(Study[WorkPrecisionRun]):
 
     def error_of(self, run: WorkPrecisionRun, quantity: Quantity = "q") -> float:
         """The error of a run, not below what the reference can tell; energy errors need no reference."""
-        if quantity not in ("q", "energy"):
-            raise InputError(f"quantity must be 'q' or 'energy', got {quantity!r}")
+        word("quantity", quantity, ("q", "energy"))
         error, floor = (run.error, self.reference_error) if quantity == "q" else (run.energy_error, 0.0)
         return max(error, floor) if math.isfinite(error) else math.nan
 

@@ -90,8 +90,6 @@ class KeepClear(PlanConstraint):
         self.margin = checked_margin(self, margin)
         itself = flag("KeepClear itself", itself)
         names = None if links is None else tuple_of("names of links", links, str)
-        if not (capsules is None or isinstance(capsules, Mapping)):
-            raise InputError(f"KeepClear capsules must map names of links to (begin, end, radius), got {capsules!r}")
         file = None if srdf is None else path_like("KeepClear srdf", srdf)
         if file is not None and not itself:
             raise InputError("KeepClear srdf leaves out pairs of links, and there are none without itself=True")

@@ -113,7 +113,9 @@ def _log_slope(e: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class _BoundRegion(BoundConstraint):
+class BoundRegion(BoundConstraint):
+    """A region on a grid."""
+
     region: _Region
     shifts: Floats  # displacement of the region at each place (K, 3), or (1, 3) where it does not move
 
@@ -143,7 +145,7 @@ class _Region(_OfFrame):
     def bind(self, horizon: Horizon) -> BoundConstraint:
         require_same(self.label, self.robot, horizon.robot)
         places, times = horizon.places
-        return _BoundRegion(self, places, times, self._rows, "m", LENGTH, self, self.shifts(times))
+        return BoundRegion(self, places, times, self._rows, "m", LENGTH, self, self.shifts(times))
 
     def shifts(self, times: Floats) -> Floats:  # noqa: ARG002
         """Displacements of the region at given times (K,) [s]: (K, 3), or (1, 3) where it does not move [m].
