@@ -364,6 +364,8 @@ MISTAKES = [
     (changed("frequency = 2.0", "frequency = 2000"), "cost[0].reference.sines[0].frequency"),
     (changed('of = "mcp"', 'of = "dip"'), "cost[0].reference.sines[0].of"),
     (changed(HELD, 'type = "frame_position"\nframe = "top"\ntarget = [0, 0, 0]'), "cost[1].frame"),
+    (changed(HELD, 'type = "frame_position"\nframe = -1\ntarget = [0, 0, 0]'), "cost[1].frame"),
+    (changed(HELD, 'type = "joint_limits"\nmargin = "wide"'), "cost[1].margin"),
     (changed(SINES, "{ times = [0.1, 0.0], values = [[0, 0], [1, 1]] }"), "cost[0].reference.times"),
     (changed(SINES, "{ times = [0.0, 0.1], values = [[0, 0], [1]] }"), "cost[0].reference.values[1]"),
     (changed("seed = 3", "seed = 0.5"), "simulate.seed"),

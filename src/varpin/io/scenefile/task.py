@@ -239,7 +239,7 @@ def _touched(term: Term, task: Task) -> Mask:
         return joints_of_frame(robot, term.frame) if term.frame else np.ones(robot.dof, dtype=np.bool_)
     if (limits := term.limits(robot)) is not None:
         rest = task.q0 if term.kind == "joint_limits" else np.zeros(robot.dof)
-        margin = term.options.get("margin", 0.0)
+        margin = term.where.at("margin").numbers(term.options.get("margin", 0.0), robot.joint_names)
         return np.asarray((term.weight != 0.0) & ((rest > limits[1] - margin) | (rest < limits[0] + margin)))
     rest = task.q0 if term.kind == "tracking" else np.zeros(robot.dof)
     if term.kind in kinds.OF_CONTROLS:
@@ -442,7 +442,7 @@ def _term(where: Where, table: Any, task: Task, horizon: tuple[float, float]) ->
     if kind in kinds.OF_JOINTS + kinds.OF_CONTROLS:
         names = task.driven if kind in kinds.OF_CONTROLS else robot.joint_names
     what = "joint" if names is not None else "component"
-    if "frame" in own and not robot.model.existFrame(own["frame"]):
+    if "frame" in own:
         where.at("frame").one_of(own["frame"], [frame.name for frame in robot.model.frames])
     axes = names if names is not None else kinds.AXES.get(kind, ("weight",))
     weight = where.at("weight").numbers(own.pop("weight", 1.0), axes, what)
