@@ -6,7 +6,6 @@ import pytest
 from findings import about
 from oracles import Mechanism, slope
 from refusals import naming, refused, unnamed
-from test_groups import forest
 
 import varpin as vp
 
@@ -177,7 +176,7 @@ def test_limits_are_held_against_what_drives_and_stops_do():
 
 
 def test_groups_that_couplings_join():
-    robot, tip, other = forest(0, 2), "0.2", "2.3"
+    robot, tip, other = vp.combine(vp.planar_chain(3), vp.planar_chain(4), prefixes=["a_", "b_"]), "a_tip", "b_tip"
     spring = vp.FrameSpring(tip, other, 5.0)
     assert vp.Scene(robot).group.tolist() == [0, 0, 0, 1, 1, 1, 1]
     assert vp.Scene(robot, forces=vp.FrameSpring(tip, [0.0, 0.0, 0.0], 5.0)).group.max() == 1
