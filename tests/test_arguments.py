@@ -16,7 +16,7 @@ from refusals import named, refused
 
 import varpin as vp
 from varpin.control.costs import BoundCost, Cost, Expansion
-from varpin.core.arrays import Diffusion, Element
+from varpin.core.arrays import ConstraintRows, Diffusion, Element, Product
 from varpin.errors import StepError
 from varpin.mechanics.forces import Force
 from varpin.mechanics.noise import BoundNoise, Noise
@@ -219,6 +219,26 @@ class TestTheCoreGetsWhatFits:
 
         with refused(vp.InputError, "Own.bind", repr(part)):
             vp.Scene(ROBOT, forces=Own())
+
+    @pytest.mark.parametrize(
+        ("changes", "fact"),
+        [
+            ({"aligned": ((0, 1),)}, "aligned"),
+            ({"aligned": ((1, 99),)}, "aligned"),
+            ({"aligned": ((1, -1),)}, "aligned"),
+            ({"labels": ()}, "label"),
+            ({"labels": ("a", "b")}, "label"),
+            ({"rows": ConstraintRows((), (Product(0, 99, 1.0, 0.0),))}, "vectors"),
+            (None, "NoneType"),
+        ],
+    )
+    def test_constraints_of_one_s_own(self, changes, fact):
+        class Own(vp.PointOnPoint):
+            def bind(self, robot):
+                return None if changes is None else super().bind(robot)._replace(**changes)
+
+        with refused(vp.InputError, "Own.bind", fact):
+            vp.Scene(ROBOT, constraints=Own("tip", (1.0, 0.0, 0.0), axes="x"))
 
     @pytest.mark.parametrize(
         ("gradient", "hessian"), [((5, 6), (2, 6, 6)), ((5, 6), (6, 6)), ((5, 1), (1, 6, 6)), ((1, 6), (5, 6, 6))]
