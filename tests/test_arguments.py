@@ -16,7 +16,7 @@ from refusals import named, refused
 
 import varpin as vp
 from varpin.control.costs import BoundCost, Cost, Expansion
-from varpin.core.arrays import Diffusion, Element
+from varpin.core.arrays import ConstraintRows, Diffusion, Element, Product
 from varpin.errors import StepError
 from varpin.mechanics.forces import Force
 from varpin.mechanics.noise import BoundNoise, Noise
@@ -292,6 +292,27 @@ def test_forces_of_one_s_own(part):
 
     with refused(vp.InputError, "Own.bind", repr(part)):
         vp.Scene(ROBOT, forces=Own())
+
+
+@pytest.mark.parametrize(
+    ("changes", "fact"),
+    [
+        ({"aligned": ((0, 1),)}, "aligned"),
+        ({"aligned": ((1, 99),)}, "aligned"),
+        ({"aligned": ((1, -1),)}, "aligned"),
+        ({"labels": ()}, "label"),
+        ({"labels": ("a", "b")}, "label"),
+        ({"rows": ConstraintRows((), (Product(0, 99, 1.0, 0.0),))}, "vectors"),
+        (None, "NoneType"),
+    ],
+)
+def test_constraints_of_one_s_own(changes, fact):
+    class Own(vp.PointOnPoint):
+        def bind(self, robot):
+            return None if changes is None else super().bind(robot)._replace(**changes)
+
+    with refused(vp.InputError, "Own.bind", fact):
+        vp.Scene(ROBOT, constraints=Own("tip", (1.0, 0.0, 0.0), axes="x"))
 
 
 @pytest.mark.parametrize(

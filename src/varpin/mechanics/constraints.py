@@ -13,6 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -299,6 +300,21 @@ class CustomConstraint(Constraint):
 
 class CustomConstraintError(InputError):
     """A function of a custom constraint raised, or returned a wrong type, shape or value."""
+
+
+def bound_constraint(constraint: Constraint, robot: Robot) -> Bound:
+    """``constraint.bind(robot)``; what a user's ``bind`` returns is refused here where it does not fit together."""
+    bound, name = constraint.bind(robot), f"{type(constraint).__name__}.bind"
+    if not isinstance(bound, Bound):
+        raise InputError(f"{name} must return a Bound, got {type(bound).__name__}")
+    rows = len(bound.rows.products) + len(bound.rows.ties) + sum(custom.rows for custom in bound.rows.customs)
+    if len(bound.labels) != rows:
+        raise InputError(f"{name} must return a label for each of its {rows} rows, got {len(bound.labels)}")
+    axes = {k for k, vector in enumerate(bound.rows.vectors) if len(vector) == 1}
+    pairs = {k for product in bound.rows.products for k in (product.x, product.y)}
+    if not (pairs <= set(range(len(bound.rows.vectors))) and axes.issuperset(chain(*bound.aligned))):
+        raise InputError(f"{name} must return indices of its vectors, those of aligned axes of one direction each")
+    return bound
 
 
 def joined(bound: Sequence[Bound]) -> tuple[Bound, NDArray[np.int64]]:

@@ -26,6 +26,7 @@ from varpin.mechanics.constraints import (
     Constraint,
     CustomConstraint,
     KinematicInput,
+    bound_constraint,
     joined,
 )
 from varpin.mechanics.custom import CustomForce, CustomForces
@@ -165,7 +166,7 @@ class Scene(Frozen):
         values: dict[str, Any] = {"robot": robot, "gravity": _gravity(gravity, robot)}
         values |= _forces(robot, forces, damping, friction, stiffness, rest)
         values["constraints"] = given_constraints(robot, constraints)
-        bound, order = joined([constraint.bind(robot) for constraint in values["constraints"]])
+        bound, order = joined([bound_constraint(constraint, robot) for constraint in values["constraints"]])
         inputs = [tie.follower for tie in filter(_is_input, bound.rows.ties)]
         servos = of_kind(values["elements"], "PositionServo")
         driven = _driven(robot, _actuation(robot, actuation), servos, inputs)
