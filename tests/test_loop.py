@@ -314,3 +314,47 @@ def test_a_law_that_cannot_be_copied_keeps_its_record():
 
     motion = vp.simulate(ROD, [0.5], [0.0], dt=1e-2, steps=100, controls=law)
     assert 0.0 < motion.error.max() < 1e-6
+
+
+def of_module(t, q, v, times=[0.0]):  # noqa: B006
+    """A function that pickle knows by its name alone, with an integral of its own."""
+    times.append(times[-1] + q[0])
+    return -q - 0.1 * v - 0.05 * times[-1]
+
+
+def test_a_law_of_a_module_is_copied_with_its_memory():
+    (times,) = of_module.__defaults__
+    motion = vp.simulate(ROD, [0.5], [0.0], dt=1e-2, steps=100, controls=of_module)
+    assert len(times) == 1 + motion.steps
+    assert not about(motion.warnings, "error")
+    assert 0.0 < motion.error.max() < 1e-6
+
+
+def test_classes_of_laws_stay_as_they_are():
+    class Integral:
+        total = np.zeros(1)
+
+        def __call__(self, t, q, v):
+            Integral.total = Integral.total + q
+            return -q - 0.1 * v - 0.05 * Integral.total
+
+    before = Integral.__call__
+    motion = vp.simulate(ROD, [0.5], [0.0], dt=1e-2, steps=100, controls=Integral())
+    assert Integral.__call__ is before
+    np.testing.assert_allclose(Integral.total, motion.q[:-1].sum(axis=0))
+    assert 0.0 < motion.error.max() < 1e-6
+
+
+class Unreadable:
+    """Pickle writes it and fails to read it."""
+
+    def __call__(self, t, q, v):
+        return -5.0 * np.sin(q) - v
+
+    def __reduce__(self):
+        return Unreadable, (1,)
+
+
+def test_a_law_whose_copy_fails_keeps_its_record():
+    motion = vp.simulate(ROD, [0.5], [0.0], dt=1e-2, steps=100, controls=Unreadable())
+    assert 0.0 < motion.error.max() < 1e-6

@@ -15,6 +15,7 @@ import math
 import pickle
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from types import FunctionType
 from typing import Any
 
 import cloudpickle
@@ -70,40 +71,53 @@ def decision(law: ControlLaw, scene: Scene, step: int, time: float, q: Floats, v
     return _called("controls(t, q, v)", lambda: law(time, q.copy(), v.copy()), read, step, time)[None]
 
 
-class KeptLaw:
-    """A control law as it was when it was kept, with all that it changes when it is called.
+class _Copier(cloudpickle.Pickler):  # type: ignore[misc]
+    """Writes a law and what it changes: functions of the law's module by value, too."""
 
-    Copies are by value, as of functions that are sent to other processes: calls of a copy change nothing of the user's.
-    Frozen objects, and those of Pinocchio, are shared.
+    def __init__(self, file: io.BytesIO, law: Any) -> None:
+        super().__init__(file)
+        while isinstance(law, functools.partial):
+            law = law.func
+        self._module = getattr(law, "__module__", None)
+        self.shared = list[object]()
+
+    def persistent_id(self, value: object) -> int | None:
+        if not (isinstance(value, Frozen) or type(value).__module__.startswith("pinocchio")):
+            return None
+        self.shared.append(value)
+        return len(self.shared) - 1
+
+    def reducer_override(self, value: object) -> Any:
+        if isinstance(value, FunctionType) and value.__module__ == self._module:
+            return self._dynamic_function_reduce(value)
+        found = super().reducer_override(value)
+        if not isinstance(value, type) or found is NotImplemented or len(found[1]) == 1:
+            return found
+        # Without its identifier, the last but one, a class is made anew: with it, copies of methods would replace those
+        # of the user's own class.
+        make, (*arguments, _, extra), *rest = found
+        return make, (*arguments, None, extra), *rest
+
+
+def copied(law: ControlLaw) -> ControlLaw | None:
+    """A copy of a control law with all that it changes when it is called; None if it cannot be copied.
+
+    Copies are by value, as of functions that are sent to other processes: calls of a copy change nothing of the user's
+    but what stands in modules that the law imports. Frozen objects, and those of Pinocchio, are shared.
     """
-
-    class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
-        def __init__(self, file: io.BytesIO, shared: list[object]) -> None:
-            super().__init__(file)
-            self._shared = shared
-
-        def persistent_id(self, value: object) -> int | None:
-            if not (isinstance(value, Frozen) or type(value).__module__.startswith("pinocchio")):
-                return None
-            self._shared.append(value)
-            return len(self._shared) - 1
-
-    def __init__(self, law: ControlLaw) -> None:
-        self._written, self._shared = io.BytesIO(), list[object]()
-        self.known = True  # whether the law can be copied
-        try:
-            self._Pickler(self._written, self._shared).dump(law)
-        except Exception as error:
-            # What a law refers to may be anything: a socket, a running generator.
-            self.known = False
-            logger.debug("a control law cannot be copied: %r", error)
-
-    def copy(self) -> ControlLaw:
-        """A copy of the law."""
-        reader = pickle.Unpickler(io.BytesIO(self._written.getvalue()))
-        reader.persistent_load = self._shared.__getitem__  # type: ignore[method-assign]
-        law: ControlLaw = reader.load()
-        return law
+    file = io.BytesIO()
+    try:
+        writer = _Copier(file, law)
+        writer.dump(law)
+        file.seek(0)
+        reader = pickle.Unpickler(file)
+        reader.persistent_load = writer.shared.__getitem__  # type: ignore[method-assign]
+        copy: ControlLaw = reader.load()
+    except Exception as error:
+        # What a law refers to may be anything: a socket, a running generator.
+        logger.debug("a control law cannot be copied: %r", error)
+        return None
+    return copy
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from varpin.mechanics.scene import Scene
 from varpin.model import joint_unit
 from varpin.signals.commands import changing, cubics, in_parts, in_parts_of_steps, open_loop, prescribing, rows, shares
 from varpin.signals.controls import Controls, commands_of
-from varpin.signals.functions import ControlLaw, KeptLaw, Sampled, decision, left_by_stages
+from varpin.signals.functions import ControlLaw, Sampled, decision, left_by_stages
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.gate import proven_error
 from varpin.simulation.limits import beyond_limits
@@ -66,7 +66,7 @@ def check(
     restart: int = 0,
     known: Floats | None = None,
     hold: int = 0,
-    law: KeptLaw | None = None,
+    law: ControlLaw | None = None,
 ) -> Trajectory:
     """The motion with its error and its warnings, the worst first.
 
@@ -78,7 +78,7 @@ def check(
         restart: Steps after which a controller corrects errors: the repetition begins anew there; 0 for none.
         known: The error, if it is known (N + 1, n): nothing is repeated.
         hold: The period of a control law in steps, 0 for none.
-        law: The law as it was before the motion.
+        law: A copy of the law as it was before the motion; None if it cannot be copied.
     """
     function = controls if isinstance(controls, Sampled) else None
     extremes = None if function is None else function.whole.extremes
@@ -97,12 +97,11 @@ def check(
     calls = isinstance(controls, OpenLoop) and closer(scene, integrator, trajectory, sampled=True)[1] > 1
     resolved = function is None or left_by_stages(function, len(integrator.stage_times)) <= _RESOLVED
     # What a law makes of an error, only its calls show.
-    alone = resolved and not (held_mean or calls or law)
+    alone = resolved and not (held_mean or calls or hold)
     proven = proven_error(scene, integrator, trajectory) if alone else None
 
     def repeat() -> tuple[Floats, Floats, float]:
-        again = law.copy() if law is not None and law.known else None
-        return repeated(scene, integrator, trajectory, controls, restart, again, hold)
+        return repeated(scene, integrator, trajectory, controls, restart, law, hold)
 
     found: tuple[Finding, ...] = ()
     if proven is not None:

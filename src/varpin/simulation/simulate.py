@@ -17,7 +17,7 @@ from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.signals.commands import open_loop
 from varpin.signals.controls import Controls, commands_of
-from varpin.signals.functions import ControlLaw, KeptLaw, Sampled, function_findings, require_law
+from varpin.signals.functions import ControlLaw, Sampled, copied, function_findings, require_law
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.check import check as checked
 from varpin.simulation.choice import given_integrator, usual_integrator
@@ -181,7 +181,7 @@ def simulate(
     state, (start,) = integrator.start(scene, q0[None], v0[None])
     held = commands.hold > 1 and not law
     record = MotionRecord(scene, integrator, dt, dw, start, commands if linear else None, held=held)
-    kept = KeptLaw(controls) if check and callable(controls) else None
+    kept = copied(controls) if check and callable(controls) else None
     interrupted = not _roll(record, state, steps, controls, commands, Reporter(progress, steps, dt), hold, check=check)
     motion = record.trajectory()
     known = None if interrupted else error
