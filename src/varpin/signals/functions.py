@@ -335,13 +335,13 @@ def _reader(name: str, scene: Scene) -> Callable[[JointValues], Floats]:
     """The function from what a user's function returns to the control (m,)."""
     shape, joints, isfinite = (scene.controls,), scene.control_joints, math.isfinite
 
-    @np.errstate(over="ignore", invalid="ignore")
     def read(value: JointValues) -> Floats:
-        # The common case: all checks take longer than many functions.
+        # The common case: all checks take longer than many functions. Squares of large values would overflow.
         if isinstance(value, np.ndarray) and value.dtype == np.float64 and value.shape == shape:
             own: Floats = value.copy()
-            return own if isfinite(own.dot(own)) else require_finite(name, own)
-        return control_values(name, value, joints, *shape)
+            return own if all(map(isfinite, own.tolist())) else require_finite(name, own)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return control_values(name, value, joints, *shape)
 
     return read
 
