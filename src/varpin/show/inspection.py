@@ -274,10 +274,8 @@ def inspect_robot(
         raise RobotError(f"robot {robot.name!r} cannot be inspected: its mass matrix or its derivatives are not finite")
     margin = Guard().branch_margin
     condition = _condition_number(jet.Lvv)
-    links, (shapes, unread) = (
-        _links(robot),
-        readable_geometry(robot) if flag("meshes", meshes) else (pin.GeometryModel(), {}),
-    )
+    links = _links(robot)
+    shapes, unread = readable_geometry(robot) if flag("meshes", meshes) else (pin.GeometryModel(), {})
     warnings = [
         *(*robot.faults, *robot.remarks, *robot.notes, *robot.limit_remarks()),
         *one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links, shapes))),

@@ -25,8 +25,8 @@ from varpin.trajectory import Trajectory
 # The measures of a motion, and the value from which on each of them is wrong. Accuracy in units of the motion itself:
 # of q shares of the largest travel and of each joint's, of v of each joint's largest, with a larger level, for a small
 # shift in time changes a peak of the velocity by much (told of from an estimate of 0.25 on, which may be a quarter too
-# small); of the energy a share of what is turned over. Structure in units
-# of rounding, with a margin for ill-conditioned mass matrices.
+# small); of the energy a share of what is turned over. Structure in units of rounding, with a margin for
+# ill-conditioned mass matrices.
 LEVELS = {
     "error": 0.05,
     "joint": 0.1,
