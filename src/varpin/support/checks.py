@@ -272,7 +272,7 @@ def count(name: str, value: Any, least: int = 0) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise InputError(f"{name} must be an integer, got {reprlib.repr(value)}")
     if not least <= value <= sys.maxsize:
-        raise InputError(f"{name} must be at least {least}, and at most {sys.maxsize}, got {reprlib.repr(value)}")
+        raise InputError(f"{name} must be at least {least}, and at most {sys.maxsize}, got {reprlib.repr(int(value))}")
     return int(value)
 
 
