@@ -12,7 +12,7 @@ import numpy as np
 from varpin.control.between_nodes import PARTS
 from varpin.control.history import Refined, Refinement, Status, part
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.sizes import FEASIBLE, NOTABLE, SLIGHT
+from varpin.control.sizes import FEASIBLE, SLIGHT, TENTH
 from varpin.control.solution import Solution
 from varpin.control.verification import Verification, excess, verify
 from varpin.errors import VarpinError
@@ -22,8 +22,8 @@ logger = logging.getLogger(__name__)
 
 # Greatest number of halvings of the step; from 6 to 20.
 _HALVINGS = 10
-# Greatest number of parts of a step in which the true cost of a plan is sought; from 64 to 1024.
-_FINEST = 64
+# Greatest number of parts of a step in which the true cost of a plan is sought; from 256 to 1024.
+_FINEST = 1024
 # Halvings without a better plan before the refinement ends: on steps that do not resolve dampers losses rise at first.
 # From 4 to 6. A search that has ended otherwise than with its last iteration gets one of them.
 _WITHOUT = 4
@@ -111,7 +111,7 @@ class _Record:
         problem = plan.problem
         # Constraints are looked at where parts end.
         first = PARTS if problem.constraints else 2
-        found = verify(plan, tolerance=NOTABLE * self.wish, substeps=first, max_substeps=_FINEST)
+        found = verify(plan, tolerance=TENTH * self.wish, substeps=first, max_substeps=_FINEST)
         row = Refined(
             dt=problem.dt,
             steps=problem.steps,
