@@ -6,6 +6,7 @@ from findings import about
 from refusals import naming, unnamed
 
 import varpin as vp
+from varpin.control.refine import refine
 
 
 def reach(steps, controls="held", **options):
@@ -138,3 +139,30 @@ def test_the_first_step_within_the_wish_is_taken(problem, wish):
     # Its controls cost no more than the wish above those of a far finer step.
     best = vp.solve(problem.at(dt=plan.problem.dt / 4), check=False).cost
     assert truth.closed_loop_cost <= (1.0 + 2.0 * wish) * best
+
+
+def test_a_refinement_that_ends_early_names_what_its_plan_violates():
+    def callback(item):
+        nonlocal plans
+        plans += item.index == 0
+        if plans == 2:
+            raise KeyboardInterrupt
+
+    plans = 0
+    reason = vp.solve(reach(12, **LIMITED), true_cost=1e-2, check=False, callback=callback).refinement.reason
+    assert not unnamed(reason, "interrupted", "violates WithinVelocityLimits on the continuous system", "rad/s", "t =")
+    assert len(reason) <= 240
+
+
+def test_a_search_that_fails_with_half_the_step_is_no_comparison():
+    """The first plan is within the wish, but may be far above the optimum of finer controls."""
+
+    def search(problem, _):
+        if problem.steps > 12:
+            raise vp.LinearizationError(0, 0.0, "of the test")
+        return vp.solve(problem, check=False)
+
+    found = refine(reach(12), search, 0.1, lambda: np.inf).refinement
+    assert abs(found.tried[0].loss) <= 0.1
+    assert not found.met
+    assert not unnamed(found.reason, "half of dt", "of the test")

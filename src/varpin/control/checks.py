@@ -194,8 +194,8 @@ def _weights(problem: OptimalControlProblem) -> Iterator[Finding]:
 def _in_degrees(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Goals, references and limits of joints that look like degrees."""
     robot = problem.scene.robot
-    for _, term in (*problem.running.parts, *problem.terminal.parts):
-        if isinstance(term, BoundTerm) and term.subject == Subject.entries and term.of == 0:
+    for term in _terms(problem):
+        if term.subject == Subject.entries and term.of == 0:
             most = np.take_along_axis(term.target, np.abs(term.target).argmax(axis=0)[None], axis=0)[0]
             if sentence := degrees_hint(robot, "the reference of a TrackingCost", most):
                 yield Finding("goal in degrees", sentence)

@@ -12,9 +12,9 @@ from varpin.control.sizes import TRACE
 from varpin.trajectory import Trajectory
 
 # Factor between the lengths of trials; from 0.3 to 0.7.
-HALF = 0.5
+_BACKTRACKING = 0.5
 # Shortest next length by the parabola, relative to the last; full steps are extended by its inverse. From 0.1 to 0.5.
-QUARTER = 0.25
+_SHARPEST = 0.25
 # Least share of the foreseen decrease below which shorter steps are tried while they are better; from 0.1 to 0.5.
 _POOR = 0.3
 # Share of what its slope gives from which on a full step is extended: at a minimum it is half. From 0.7 to 0.95.
@@ -76,11 +76,11 @@ def line_search(
         elif length > 0.0:
             break
         least = 0.5 / (1.0 - trial.merit / (a * slope)) if trial.merit > a * slope else 1.0
-        a *= QUARTER if least <= QUARTER else HALF
+        a *= _SHARPEST if least <= _SHARPEST else _BACKTRACKING
     while extends and length >= 1.0 and best.merit <= length * _EARLY * slope:
-        longer = attempt(length / QUARTER)
+        longer = attempt(length / _SHARPEST)
         trials += 1
         if longer.merit >= best.merit:
             break
-        best, length = longer, length / QUARTER
+        best, length = longer, length / _SHARPEST
     return Taken(best, length, trials, last)

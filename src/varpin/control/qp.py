@@ -13,9 +13,8 @@ import piqp
 import scipy.sparse as sp
 
 from varpin.arrays import Floats, Integers
-from varpin.control.constraints.base import LENGTH
 from varpin.control.riccati import Plan
-from varpin.control.sizes import FEASIBLE, HARMLESS, ROUNDING
+from varpin.control.sizes import FEASIBLE, HARMLESS, ROUNDING, TENTH
 from varpin.control.stages import Rows, Stages
 
 # Residuals at which the solver stops, absolute for a cost of gradient one, and relative; from 1e-12 to 1e-10.
@@ -170,7 +169,7 @@ class _Form:
                 solver.setup(P, c, A, b, G, None, most, lower, upper)
             status, known = solver.solve(), solver.result.info
             # Where weights are far apart more is left: a tenth of what a row may be violated by does no harm.
-            rounded = max(known.primal_res, known.dual_res) <= LENGTH * FEASIBLE
+            rounded = max(known.primal_res, known.dual_res) <= TENTH * FEASIBLE
             if status == piqp.PIQP_SOLVED or (status == piqp.PIQP_MAX_ITER_REACHED and rounded):
                 return solver.result
             if status == piqp.PIQP_PRIMAL_INFEASIBLE:

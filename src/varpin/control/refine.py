@@ -12,15 +12,18 @@ import numpy as np
 from varpin.control.between_nodes import PARTS
 from varpin.control.history import Refined, Refinement, Status, part
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.search import PATIENCE
-from varpin.control.sizes import FEASIBLE, NOTABLE, SLIGHT
+from varpin.control.sizes import FEASIBLE, SLIGHT, TENTH
 from varpin.control.solution import Solution
-from varpin.control.verification import excess, verify
+from varpin.control.verification import Verification, excess, verify
 from varpin.errors import VarpinError
 from varpin.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
 
+# Greatest number of halvings of the step; from 6 to 20.
+_HALVINGS = 10
+# Greatest number of parts of a step in which the true cost of a plan is sought; from 256 to 1024.
+_FINEST = 1024
 # Halvings without a better plan before the refinement ends: on steps that do not resolve dampers losses rise at first.
 # From 4 to 6. A search that has ended otherwise than with its last iteration gets one of them.
 _WITHOUT = 4
@@ -41,31 +44,28 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
     record = _Record(wish, search)
     plan: Solution | None = None
     start: Trajectory | None = None
-    good = False
     while True:
         began, doing = time.perf_counter(), f"with dt = {problem.dt:g} s"
         try:
             plan = plan or record.search(problem, start)
-            finer = None
-            good = record.add(plan, began)
+            compares = record.add(plan, began) and time_left() > 0.0
             ended = record.ended(plan.reason) if time_left() > 0.0 else f"the time limit came {doing}"
             doing = f"with half of dt = {problem.dt:g} s"
-            # Held controls keep their period.
-            hold = problem.hold if problem.hold == 1 else 2 * problem.hold
-            problem = problem.at(dt=0.5 * problem.dt, steps=2 * problem.steps, hold=hold)
-            start = problem.simulate(plan.policy_on(substeps=2))
-            if good and time_left() > 0.0:
-                finer = record.search(problem, start)
-                if record.compare(finer, began):
-                    return record.result(plan, len(record.tried) - 1, "")
+            half, fails = _halved(problem)
+            if compares and half is None:
+                return record.result(plan, len(record.tried) - 1, "")
+            if half is None or (ended and not compares):
+                return record.result(record.best, record.chosen, ended or fails)
+            problem, start = half, half.simulate(plan.policy_on(substeps=2))
+            finer = record.search(problem, start) if compares else None
+            if finer is not None and record.compare(finer, began):
+                return record.result(plan, len(record.tried) - 1, "")
             if ended:
                 return record.result(record.best, record.chosen, ended)
-            plan, good = finer, False
+            plan = finer
         except VarpinError as error:
             if record.best is None:
                 raise
-            if good and plan is not None:
-                return record.result(plan, len(record.tried) - 1, "")
             return record.result(record.best, record.chosen, f"{doing} there is no plan: {error}")
         except KeyboardInterrupt:
             if record.best is None:
@@ -73,6 +73,15 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
             reason = f"interrupted {doing}"
             best = replace(record.best, status=Status.INTERRUPTED, reason=reason)
             return record.result(best, record.chosen, reason)
+
+
+def _halved(problem: OptimalControlProblem) -> tuple[OptimalControlProblem | None, str]:
+    """The problem with half the step, held controls with their period; or why there is none."""
+    hold = problem.hold if problem.hold == 1 else 2 * problem.hold
+    try:
+        return problem.at(dt=0.5 * problem.dt, steps=2 * problem.steps, hold=hold), ""
+    except VarpinError as error:
+        return None, f"with half of dt = {problem.dt:g} s there is no plan: {error}"
 
 
 class _Record:
@@ -83,6 +92,7 @@ class _Record:
         self.tried: list[Refined] = []
         self.best: Solution | None = None
         self.rank, self.chosen = (np.inf, np.inf), 0
+        self.beyond = ""  # what the best plan violates on the continuous system, in words
 
     def search(self, problem: OptimalControlProblem, start: Trajectory | None) -> Solution:
         """The plan of a step from a motion; interrupted, it is the best where there is no other."""
@@ -101,7 +111,7 @@ class _Record:
         problem = plan.problem
         # Constraints are looked at where parts end.
         first = PARTS if problem.constraints else 2
-        found = verify(plan, tolerance=NOTABLE * self.wish, substeps=first, max_substeps=PARTS**2)
+        found = verify(plan, tolerance=TENTH * self.wish, substeps=first, max_substeps=_FINEST)
         row = Refined(
             dt=problem.dt,
             steps=problem.steps,
@@ -125,6 +135,7 @@ class _Record:
         rank = kind, value if np.isfinite(value) else np.inf
         if rank < self.rank:
             self.best, self.rank, self.chosen = plan, rank, len(self.tried) - 1
+            self.beyond = _beyond(found) if kind >= 2 else ""
         return kind == 0
 
     def compare(self, finer: Solution, began: float) -> bool:
@@ -148,8 +159,8 @@ class _Record:
     def ended(self, reason: str) -> str:
         """Why the step may not be halved after a search that ended for a ``reason``; empty if it may."""
         row, without = self.tried[-1], len(self.tried) - 1 - self.chosen
-        if len(self.tried) > PATIENCE:
-            return f"the step has been halved {PATIENCE} times"
+        if len(self.tried) > _HALVINGS:
+            return f"the step has been halved {_HALVINGS} times"
         if without < (_WITHOUT if row.status in (Status.CONVERGED, Status.MAX_ITERATIONS) else 1):
             return ""
         if row.status is Status.INFEASIBLE:
@@ -165,6 +176,16 @@ class _Record:
             lost = f"loses {part(row.loss)}" if np.isfinite(row.loss) else "has no known true cost"
             above = f"costs about {part(row.excess)} more than the optimum of finer controls"
             above = above if np.isfinite(row.excess) else "is not compared with finer controls"
+            # A plan that violates constraints is not compared.
+            above = self.beyond if ended and self.beyond else above
             reason += f"the plan of dt = {row.dt:g} s {lost} and {above}"
         logger.log(logging.WARNING if ended else logging.INFO, "%s: %s", plan.problem.scene.robot.name, reason)
         return replace(plan, refinement=Refinement(self.wish, not ended, tuple(self.tried), chosen, reason))
+
+
+def _beyond(found: Verification) -> str:
+    """The constraint that is violated most, by how much and where, in words; empty where all hold."""
+    worst = max(found.constraints, key=lambda own: own.share, default=None)
+    if worst is None or not worst.where:
+        return ""
+    return f"violates {worst.label} on the continuous system by {worst.closed_loop:.2g} {worst.unit} ({worst.where})"

@@ -22,7 +22,7 @@ from varpin.control.between_nodes import NOWHERE, Instants, enforced, followed
 from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.history import Iteration, SearchState, Status
-from varpin.control.line_search import HALF, QUARTER, Taken, Trial, line_search
+from varpin.control.line_search import Taken, Trial, line_search
 from varpin.control.margins import Tightening
 from varpin.control.multipliers import Multipliers, flat, split
 from varpin.control.problem import OptimalControlProblem
@@ -30,7 +30,7 @@ from varpin.control.qp import Minimum, Program, changes
 from varpin.control.riccati import Plan, backward, foreseen, noise_shares
 from varpin.control.rollout import around
 from varpin.control.second_order import curvature_along
-from varpin.control.sizes import FEASIBLE, HARMLESS, NOTABLE, ROUNDING, SLIGHT, TENTH, TRACE
+from varpin.control.sizes import FEASIBLE, HARMLESS, NOTABLE, ROUNDING, SLIGHT, TRACE
 from varpin.control.solution import Solution
 from varpin.control.stages import Layout, Rows, Stages, Steps, states
 from varpin.core.arrays import Commands
@@ -49,9 +49,12 @@ logger = logging.getLogger(__name__)
 
 # Errors that reject a trial, or end a search that has made a step.
 TRIAL_ERRORS = (CostError, NoiseFieldError, CustomForceError, StepError, LinearizationError)
-# Iterations that together gain no more than the tolerance, or hardly lower violations, before a search ends; halvings
-# of a step before a refinement ends. From 6 to 20.
-PATIENCE = 10
+# Factor by which the regularization grows, and lengths of steps from which on it falls, and up to which it rises; from
+# 1.5 to 3, 0.1 to 0.5 and 0.05 to 0.3.
+_GROWTH, _LONG, _SHORT = 2.0, 0.25, 0.1
+# Iterations that together gain no more than the tolerance, or hardly lower violations, before a search ends; from 6 to
+# 20.
+_PATIENCE = 10
 # Weight of the rows in the merit: this many times the largest multiplier, and at most _HEAVY times, as heavy rows
 # shorten steps; where rows cannot all be met, this many times what the cost is per violation. From 3 to 100.
 _ABOVE, _HEAVY = 1.5, 10.0
@@ -413,13 +416,13 @@ class Search:
             left = step.minimum is not None and step.elastic and step.minimum.slack >= (1.0 - TRACE) * bad
             if left and step.decrease <= max(share, TRACE * dear):
                 return Status.INFEASIBLE
-            stays = len(merits) > PATIENCE and merits[-PATIENCE - 1] - min(merits[-PATIENCE:]) <= NOTABLE * dear
+            stays = len(merits) > _PATIENCE and merits[-_PATIENCE - 1] - min(merits[-_PATIENCE:]) <= NOTABLE * dear
             return Status.INFEASIBLE if stays else None
         if step.decrease <= share:
             return Status.CONVERGED
-        gained = sum(item.decrease for item in self.history[-PATIENCE:])
-        if len(self.history) > PATIENCE and gained <= share:
-            self.reason = f"{PATIENCE} iterations have lowered the merit by {gained:.1e}; {self._numbers(tolerance)}"
+        gained = sum(item.decrease for item in self.history[-_PATIENCE:])
+        if len(self.history) > _PATIENCE and gained <= share:
+            self.reason = f"{_PATIENCE} iterations have lowered the merit by {gained:.1e}; {self._numbers(tolerance)}"
             return Status.STALLED
         return None
 
@@ -613,17 +616,17 @@ class Search:
         It falls after long steps, and rises after none or two short ones in a row.
         """
         lengths = [item.step for item in self.history[-2:]]
-        if lengths[-1] >= QUARTER:
-            self.growth = min(HALF, HALF * self.growth)
+        if lengths[-1] >= _LONG:
+            self.growth = min(1.0 / _GROWTH, self.growth / _GROWTH)
             self.regularization *= self.growth
             if self.regularization < TRACE:
                 self.regularization = 0.0
-        elif lengths[-1] == 0.0 or (max(lengths) <= TENTH and len(lengths) > 1):
+        elif lengths[-1] == 0.0 or (max(lengths) <= _SHORT and len(lengths) > 1):
             return self._stiffen()
         return True
 
     def _stiffen(self) -> bool:
-        self.growth = max(1.0 / HALF, self.growth / HALF)
+        self.growth = max(_GROWTH, self.growth * _GROWTH)
         self.regularization = max(TRACE, self.regularization * self.growth)
         return self.regularization <= 1.0 / ROUNDING
 

@@ -15,5 +15,5 @@ FEASIBLE = 1e-6
 SLIGHT = 1e-3
 # Shares worth a warning, and what searches have to gain; from 3e-3 to 3e-2.
 NOTABLE = 1e-2
-# Shares that few iterations may leave, and by which margins may grow; from 0.05 to 0.3.
+# Shares of an allowance that errors may take or few iterations leave, and by which margins grow; from 0.05 to 0.3.
 TENTH = 0.1

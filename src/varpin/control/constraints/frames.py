@@ -18,13 +18,14 @@ from varpin.control.constraints.base import (
     PlanConstraint,
     checked_margin,
 )
-from varpin.control.sizes import SLIGHT
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
 from varpin.model.kinematics import frame_kinematics, require_same
 from varpin.support.checks import finite, finite_array, named_limits, over_time, positive, rotation_matrix
 
 _XYZ = ("x", "y", "z")
+# Angle [rad] below which a series replaces the formula, which cancels there; from 1e-4 to 1e-2.
+_SMALL = 1e-3
 
 
 class _OfFrame(PlanConstraint):
@@ -106,7 +107,7 @@ def _log_slope(e: Floats) -> Floats:
     """The inverse of SO(3)'s right Jacobian at the rotation vector e (3,): d log(R) over the body's rotation."""
     angle = float(np.linalg.norm(e))
     E = np.array([[0.0, -e[2], e[1]], [e[2], 0.0, -e[0]], [-e[1], e[0], 0.0]])
-    near = angle < SLIGHT
+    near = angle < _SMALL
     part = 1.0 / 12.0 + angle**2 / 720.0 if near else 1.0 / angle**2 - 0.5 / (angle * np.tan(0.5 * angle))
     slope: Floats = np.eye(3) + 0.5 * E + part * E @ E
     return slope

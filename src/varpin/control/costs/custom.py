@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.control.costs.base import BoundCost, Cost, CostError, Expansion, Points
-from varpin.control.sizes import TENTH, TRACE
 from varpin.support.checks import as_floats, finite_array, require_function
 
 Function = Callable[[Floats, Floats, Floats, Floats], ArrayLike]
@@ -18,10 +17,10 @@ Derivatives = Callable[[Floats, Floats, Floats, Floats], tuple[ArrayLike, ArrayL
 
 # Step of differences, by the size of what is moved: between 1e-4 and 1e-2 errors of rounding and of order balance.
 _STEP = 1e-3
-# Rounding errors of differences of a function, by its size; from 1e-12 to 1e-10.
-_ROUNDED = 1e-11
-# Errors of the differences by the largest entry, of fourth and of second order in the step.
-_ERRORS = _STEP**2, TENTH * _STEP
+# Asymmetry of a Hessian, by its largest entry, that is no rounding.
+_SYMMETRY = 1e-8
+# Errors of differences, by the largest entry and by the function's size over the step, of gradients and of Hessians.
+_ERRORS = (1e-6, 1e-11), (1e-4, 1e-12)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -94,7 +93,7 @@ class _BoundCustom(BoundCost):
         except Exception as error:
             raise CostError(self.cost.name, f"derivatives(t, q, v, u) failed: {error}") from error
         gap = np.abs(hessian - np.swapaxes(hessian, 1, 2))
-        off = gap > TRACE * np.abs(hessian).max(axis=(1, 2), initial=0.0, keepdims=True)
+        off = gap > _SYMMETRY * np.abs(hessian).max(axis=(1, 2), initial=0.0, keepdims=True)
         if off.any():
             j, a, b = np.argwhere(off)[0]
             both = f"Hessian[{j}, {a}, {b}] is {hessian[j, a, b]:.6g} and Hessian[{j}, {b}, {a}] {hessian[j, b, a]:.6g}"
@@ -115,9 +114,9 @@ class _BoundCustom(BoundCost):
         differences = found.gradient, found.hessian
         for i, name in enumerate(("gradient", "Hessian")):
             claimed, expected = np.broadcast_to(given[i], differences[i].shape), differences[i]
+            relative, absolute = _ERRORS[i]
             # Not "greater": differences that are NaN must not pass.
-            allowed = _ERRORS[i] * np.abs(expected).max(axis=0) + _ROUNDED * size / steps[i]
-            off = ~(np.abs(claimed - expected) <= allowed)
+            off = ~(np.abs(claimed - expected) <= relative * np.abs(expected).max(axis=0) + absolute * size / steps[i])
             if off.any():
                 where = tuple(int(i) for i in np.argwhere(off)[0])
                 raise CostError(

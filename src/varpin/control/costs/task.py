@@ -38,14 +38,16 @@ class _TaskCost(LeastSquares):
     shape: tuple[int, ...] = (3,)  # of a constant target
     _of: FrameKinematics | Links
 
-    def _take(self, robot: Robot, target: ReferenceValues, weight: ArrayLike, **of: str) -> None:
+    def _take(self, robot: Robot, target: ReferenceValues, weight: ArrayLike) -> None:
         name = type(self).__name__
         self.robot = require_robot(robot, name)
-        vars(self).update(of)
-        self._of = frame_kinematics(robot, **of) if of else mass_carriers(robot)
+        self._of = self._place()
         self.weight = checked_weight(name, weight)
         weight_matrix(name, self.weight, self.shape[0])
         self.target = checked_reference(name, target)
+
+    def _place(self) -> FrameKinematics | Links:
+        return frame_kinematics(self.robot, self.frame)
 
     @property
     def timed(self) -> bool:
@@ -69,7 +71,8 @@ class _FrameCost(_TaskCost):
                 problem's N + 1 nodes. Between nodes it is linear; rotations turn evenly.
             weight: One number, a vector or a matrix, positive semidefinite; zeros leave directions out.
         """
-        self._take(robot, target, weight, frame=frame)
+        self.frame = frame
+        self._take(robot, target, weight)
 
 
 class FramePositionCost(_FrameCost):
@@ -100,8 +103,8 @@ class FrameOrientationCost(_FrameCost):
             raise
         return replace(bound, target=bound.target.reshape(-1, 9))
 
-    def _take(self, robot: Robot, target: ReferenceValues, weight: ArrayLike, **of: str) -> None:
-        super()._take(robot, target, weight, **of)
+    def _take(self, robot: Robot, target: ReferenceValues, weight: ArrayLike) -> None:
+        super()._take(robot, target, weight)
         if isinstance(self.target, np.ndarray) and self.target.shape[-2:] == (3, 3):
             _require_rotations(self.target.reshape(-1, 3, 3))
 
@@ -135,6 +138,9 @@ class CenterOfMassCost(_TaskCost):
             InputError: The links have no mass, or a weight is no such weight.
         """
         self._take(robot, target, weight)
+
+    def _place(self) -> Links:
+        return mass_carriers(self.robot)
 
 
 _DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
@@ -170,7 +176,8 @@ class ManipulabilityCost(_TaskCost):
                 some of x, y, z, rx, ry, rz, in world axes.
         """
         self.least = positive("ManipulabilityCost least", least, "m or rad for each direction")
-        self._take(robot, self.least, weight, frame=frame)
+        self.frame = frame
+        self._take(robot, self.least, weight)
         if self.weight.ndim:
             raise InputError(f"ManipulabilityCost weight must be one number, got shape {self.weight.shape}")
         names = _SETS.get(directions, ()) if isinstance(directions, str) else directions
