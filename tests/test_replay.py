@@ -189,7 +189,7 @@ def test_a_model_without_geometry_gets_a_skeleton(show, browser, caplog):
         show(vp.planar_chain(3), np.zeros((2, 3)), dt=1.0)
     assert naming(caplog.messages, "'chain3'", "skeleton")
     poses = shape_poses(browser)
-    for place in np.arange(0.0, 3.0, 0.5):
+    for place in (*np.arange(0.0, 3.0, 0.5), *np.arange(0.25, 3.0)):
         assert any(np.allclose(pose[:3, 3], [place, 0.0, 0.0], atol=1e-6) for pose in poses.values())
 
 
