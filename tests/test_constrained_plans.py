@@ -142,6 +142,11 @@ def test_of_a_start_off_the_constraints_it_is_said_that_it_was_moved(caplog):
     caplog.clear()
     vp.advise(other, q + 1e-3, np.zeros(4), duration=0.1, tolerance=1e-3)
     assert about(caplog.messages, "start off the constraints")
+    starts, options = q + np.array([[0.0], [1e-3]]), {"dt": 0.01, "steps": 2}
+    paths = vp.simulate_ensemble(scene, starts, np.zeros(4), paths=2, rng=0, **options)
+    assert about(paths.warnings, "start off the constraints")
+    alone = vp.simulate(scene, starts[1], np.zeros(4), **options)
+    np.testing.assert_allclose(paths.q[1], alone.q, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])

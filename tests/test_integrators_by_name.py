@@ -85,6 +85,17 @@ def test_what_made_a_motion_is_held_against_what_is_given():
     np.testing.assert_array_equal(vp.linearize(scene, foreign, integrator=Own()).A, vp.linearize(scene, motion).A)
 
 
+def test_the_reference_keeps_to_its_tolerances():
+    """Ten periods of an oscillator in one step."""
+    scene, given = vp.Scene(vp.planar_chain(1), gravity=False, stiffness=3.0), {"dt": 20.0 * np.pi / 3.0, "steps": 1}
+    for own, least, most in (((1e-13,), 0.0, 2e-12), ((1e-6,), 1e-9, 1e-4), ((1e-13, 1e-6), 1e-9, 1e-4)):
+        motion = vp.simulate(scene, [0.7], [0.3], integrator=vp.Reference(*own), **given)
+        assert least <= abs(motion.q[-1, 0] - 0.7) < most
+    for name, wrong in (("rtol", 1e-15), ("rtol", 0.5), ("atol", 0.0)):
+        with refused(vp.InputError, name, repr(wrong)):
+            vp.Reference(**{name: wrong})
+
+
 def test_the_reference_takes_no_noise():
     noisy = vp.Scene(vp.load_robot("finger"), noise=vp.AdditiveNoise(1e-3))
     with refused(vp.InputError, "noise"):

@@ -135,6 +135,11 @@ def test_noise_of_the_other_controls(interpolation):
     options = {"dt": 0.08, "steps": 6, "integrator": problem.integrator, "increments": motion.dw[:, 1:2]}
     again = vp.simulate(alone, [0.0, 0.2], [0.0, 0.0], controls=motion.u, **options)
     np.testing.assert_allclose(again.q, motion.q, atol=1e-12)
+    white = vp.Scene(robot, noise=vp.AdditiveNoise(0.3), **given)
+    del options["increments"]
+    paths = vp.simulate_ensemble(white, [0.0, 0.2], [0.0, 0.0], controls=motion.u, paths=5, rng=0, **options)
+    np.testing.assert_allclose(paths.q[:, 1:, 0], np.tile(motion.u[:, 0], (5, 1)), atol=1e-12)
+    assert np.ptp(paths.q[:, -1, 1]) > 1e-3
 
 
 CRANK = cranked()

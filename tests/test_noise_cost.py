@@ -80,7 +80,9 @@ def test_paths_cost_what_the_plan_expects(integrator):
     ]
     within = left_within_steps(*of(plan))
     assert (within > 0.0) == integrator.holds_noise
-    assert plan.monte_carlo(2, rng=0).cost == pytest.approx(np.mean(again) + within, rel=1e-12)
+    found = plan.monte_carlo(2, rng=0)
+    assert found.cost == pytest.approx(np.mean(again) + within, rel=1e-12)
+    assert found.standard_error == pytest.approx(np.ptp(again) / 2.0, rel=1e-9)
 
 
 def in_parts(plan, parts=16):

@@ -142,3 +142,16 @@ def test_geometry_goes_along():
         (shape,) = geometry(back).geometryObjects
         assert shape.geometry.halfSide.tolist() == [0.05, 0.1, 0.15]
         assert shape.meshColor.tolist() == [0.1, 0.2, 0.3, 0.4]
+
+
+ERRORS = {kind for kind in vars(vp).values() if isinstance(kind, type) and issubclass(kind, vp.VarpinError)}
+
+
+@pytest.mark.parametrize("kind", sorted(ERRORS, key=lambda kind: kind.__name__), ids=lambda kind: kind.__name__)
+def test_errors_of_every_kind_go_round(kind):
+    """Whatever they are made of: with what they say and hold."""
+    error = kind.__new__(kind, "said")
+    error.step, error.known = 3, ("a", "b")
+    for way in WAYS:
+        back = way(error)
+        assert (type(back), str(back), vars(back)) == (kind, "said", vars(error))

@@ -391,6 +391,9 @@ def test_torques_of_a_loop_with_a_limit_of_the_rate_do_not_jump():
     ends = np.array([plan.controls[:2] for plan in run.plans])
     assert_allclose(ends[0, 0], hold, atol=1e-12)
     assert_allclose(ends[1:, 0], ends[:-1, 1], atol=1e-4)
+    # No plan comes in time: the feedback of the first one keeps to the limit, too.
+    late = vp.Mpc(problem, budget=1e-9).run(plant, duration=0.4, rng=0).motion
+    assert np.abs(np.diff(late.u, axis=0)).max() <= 40.0 * (1.0 + 1e-9) * late.dt
 
 
 def test_failed_ticks():

@@ -205,6 +205,7 @@ def test_verification_prints_the_loss_in_percent():
     assert "inf" not in lost
     # Nothing is a part of a cost of nothing.
     assert "+0.00 %" in str(vp.Verification(0.0, 0.0, 1e-9, 0.0, 0.0, 4, 0.0))
+    assert vp.Verification(0.0, -1.0, 1.0, 0.0, 0.0, 4, 0.0).open_loop_loss == -np.inf
 
 
 def test_monte_carlo_prints_how_far_it_is_from_the_prediction():
