@@ -229,3 +229,8 @@ def test_sizes_in_millimetres_and_grams(load, facts, caplog):
     assert not caplog.records
     load(1000.0)
     assert len(naming(caplog.messages, facts)) == 1
+
+
+def test_a_payload_on_a_link_that_is_held_takes_nothing_from_the_robot(caplog):
+    vp.load_robot("ur5", lock={"shoulder_pan_joint": 0.0}, payload=vp.Payload("shoulder_link", 14.0))
+    assert not caplog.records

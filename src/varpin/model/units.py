@@ -103,7 +103,7 @@ def odd_sizes(robot: Robot, payload: Iterable[Payload]) -> Iterator[str]:
         joints = f"{names[int(tree.parent[body]) + 1]!r} and {names[body + 1]!r}"
         yield f"the link between joints {joints} is {hops[body]:.4g} m long: {IN_MILLIMETRES}"
     span = max(longest_reach(robot, centers=False), _LEAST)
-    mass = float(tree.mass.sum()) - sum(part.mass for part in carried)
+    mass = sum(own.mass for own in robot.model.inertias) - sum(part.mass for part in carried)
     for part in carried:
         away = float(np.linalg.norm(part.center))
         if away > AFAR * span:
