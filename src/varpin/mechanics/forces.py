@@ -108,7 +108,7 @@ def shown(value: Any) -> str:
         return str(getattr(value, "__name__", repr(value)))
     if isinstance(value, tuple):
         return f"({', '.join(map(shown, value))})"
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray | np.generic):
         return str(value.tolist())
     return repr(dict(value) if isinstance(value, Mapping) else value)
 
