@@ -19,7 +19,7 @@ from varpin.integrators import Integrator
 from varpin.linearization import linearize
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.study.exact import START, Exact, velocity_change
+from varpin.study.exact import START, Exact, lasting, velocity_change
 from varpin.trajectory import Trajectory
 
 # The measures of a motion, and the value from which on each of them is wrong. Accuracy in units of the motion itself:
@@ -61,8 +61,7 @@ def energy_error(scene: Scene, trajectory: Trajectory) -> float:
     work = np.append(0.0, np.cumsum(np.einsum("ki,ki->k", force, way)))
     off = trajectory.energy - trajectory.energy[0] - work
     off = np.maximum(off, 0.0) if scene.dissipates else np.abs(off)
-    # What changes hands a step too late is no error of the motion.
-    off = np.minimum(off, np.append(off[1:], off[-1]))
+    off = lasting(off, np.arange(len(off)))
     some = trajectory.q[_spread(trajectory.steps, _FEW_NODES)]
     inertia = np.max([np.diag(_pinocchio(scene, q, np.zeros_like(q))[2]) for q in some], axis=0)
     scale = min(kinetic.max(), 0.5 * inertia @ velocity_change(trajectory.v) ** 2) + np.abs(work).max()

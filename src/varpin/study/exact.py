@@ -55,19 +55,29 @@ class Exact:
         """Largest distances of a motion, none if it ends before the first node.
 
         ``error`` in q, in units of the travel; ``joint`` in q and ``velocity`` in v, each joint in units of its own
-        travel and velocity, so that a far or fast joint does not hide the others. Of velocities at successive nodes the
-        smaller error counts: one that lasts for a step is of a jump that comes late.
+        travel and velocity, so that a far or fast joint does not hide the others. Errors of velocities are those that
+        last.
         """
         nodes = self.nodes[self.nodes <= trajectory.steps]
         if not len(nodes):
             return {}
         q, v = (np.abs(a[nodes] - b[: len(nodes)]) for a, b in ((trajectory.q, self.q), (trajectory.v, self.v)))
-        lasting = np.where(np.diff(nodes, append=0)[:, None] == 1, np.minimum(v, np.roll(v, -1, axis=0)), v)
         return {
             "error": float(q.max() / self.travel),
             "joint": float((q / self.travels).max()),
-            "velocity": float((lasting / self.speeds).max()),
+            "velocity": float((lasting(v, nodes) / self.speeds).max()),
         }
+
+
+def lasting(errors: Floats, nodes: NDArray[np.int64]) -> Floats:
+    """Errors (K, ...) at nodes (K,), each but the smaller of it and the next where that is a step later.
+
+    What comes a step too late, as after a jump, is no error of the motion.
+    """
+    after = np.append(errors[1:], errors[-1:], axis=0)
+    followed = np.append(np.diff(nodes) == 1, False).reshape(-1, *[1] * (errors.ndim - 1))
+    found: Floats = np.where(followed, np.minimum(errors, after), errors)
+    return found
 
 
 def before_step(integrator: Integrator) -> float | None:
