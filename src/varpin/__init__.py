@@ -147,6 +147,9 @@ if TYPE_CHECKING:
     from varpin.ensemble import EnsembleStatistics as EnsembleStatistics
     from varpin.ensemble import PathFailure as PathFailure
     from varpin.ensemble import simulate_ensemble as simulate_ensemble
+    from varpin.estimation.sensitivities import Gradient as Gradient
+    from varpin.estimation.sensitivities import Sensitivities as Sensitivities
+    from varpin.estimation.sensitivities import sensitivities as sensitivities
     from varpin.io.scenefile import SceneFile as SceneFile
     from varpin.io.scenefile import SceneFileError as SceneFileError
     from varpin.io.scenefile import load_scene as load_scene
@@ -198,6 +201,7 @@ _LATE = {
     ),
     "varpin.control.mpc": "Mpc MpcRun Plant",
     "varpin.ensemble": ("Ensemble EnsembleInterrupted EnsembleStatistics PathFailure simulate_ensemble"),
+    "varpin.estimation.sensitivities": "Gradient Sensitivities sensitivities",
     "varpin.io.scenefile": "SceneFile SceneFileError load_scene",
     "varpin.linearization": "Curvature Linearization Moments linearize propagate_moments second_order",
     "varpin.model.clearance": "Obstacle",

@@ -120,7 +120,7 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
             a scene with other gravity, damping, springs, inertias or actuation; or its integrator is unknown.
         LinearizationError: A step has no solution at dw = 0.
     """
-    integrator = _matching(require_scene(scene), trajectory, integrator)
+    integrator = matching_integrator(require_scene(scene), trajectory, integrator)
     within = trajectory.u_stages.shape[1] > 0 or trajectory.u_nodes.shape[1] > 0
     found = linearize_steps(scene, trajectory, integrator, trajectory.q[0], ramps=within)
     if not integrator.variational:
@@ -231,7 +231,7 @@ def second_order(
             velocity.
         LinearizationError: A step has no solution at dw = 0.
     """
-    integrator = _matching(require_scene(scene), trajectory, integrator)
+    integrator = matching_integrator(require_scene(scene), trajectory, integrator)
     n, steps = scene.robot.dof, trajectory.steps
     rows = as_floats("z", z)
     if rows.shape == (2 * n,):
@@ -345,7 +345,7 @@ def _drift_derivatives(
     return in_state, by_begin + by_end, by_end
 
 
-def _matching(scene: Scene, trajectory: Trajectory, given: Integrator | None) -> Integrator:
+def matching_integrator(scene: Scene, trajectory: Trajectory, given: Integrator | None) -> Integrator:
     """The integrator of the trajectory, after a check that the trajectory fits the scene."""
     require_motion(scene, trajectory)
     integrator = _integrator_of(scene, trajectory, given)

@@ -14,8 +14,8 @@ namespace {
 
 using namespace nanobind::literals;
 
-std::tuple<Out, Out, Out, std::int64_t, std::size_t> constrained_derivatives(const StepsAt& at, In<2> places,
-                                                                             In<2> rates, bool ramp, bool external) {
+auto constrained_derivatives(const StepsAt& at, In<2> places, In<2> rates, bool ramp, bool external,
+                             const Parameters* parameters) {
     const auto stages = static_cast<std::size_t>(at.tableau.stages);
     require(places, "places", {stages + 1, stages});
     const std::vector<double> t(places.data(), places.data() + places.size());
@@ -25,9 +25,10 @@ std::tuple<Out, Out, Out, std::int64_t, std::size_t> constrained_derivatives(con
     if (external) work.take_external();
     const std::size_t moved = at.mechanism.constraints.driven().size();
     require(rates, "rates", {at.N, moved});
-    return at.derivatives(moved, [&](std::size_t s, double* Jx, double* Jf, double* Jr) {
+    work.take(Parameters::of(parameters, at.n));
+    return at.derivatives(moved, work.parameters(), [&](std::size_t s, double* Jx, double* Jf, double* Jr, double* Jp) {
         return work.first(at.h, at.q(s), at.p(s), at.guess(s), at.force(s), rates.data() + s * moved, at.halvings(s),
-                          Jx, Jf, Jr);
+                          Jx, Jf, Jr, Jp);
     });
 }
 
@@ -41,7 +42,7 @@ std::unique_ptr<VariationalStepper> constrained_stepper(const Mechanism& mechani
 
 void register_constrained(nb::module_& m) {
     m.def("constrained_derivatives", &constrained_derivatives, "steps"_a, nb::kw_only(), "places"_a, "rates"_a,
-          "ramp"_a = false, "external"_a = false);
+          "ramp"_a = false, "external"_a = false, "parameters"_a.none() = nb::none());
 }
 
 }  // namespace varpin::border

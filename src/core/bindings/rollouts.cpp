@@ -172,14 +172,16 @@ VariationalLinearization linearization(const StepsAt& at) {
     return {at.mechanism, at.tableau, at.tolerance, at.guards, kernels_of(at.mechanism)};
 }
 
-std::tuple<Out, Out, Out, std::int64_t, std::size_t> derivatives(const StepsAt& at, bool ramp, bool external) {
+auto derivatives(const StepsAt& at, bool ramp, bool external, const Parameters* parameters) {
     VariationalLinearization work = linearization(at);
     work.varies = at.varies;
     if (external) work.take_external();
-    return at.derivatives(ramp ? at.n : 0, [&](std::size_t s, double* Jx, double* Jf, double* Jr) {
-        return work.first(at.h, at.q(s), at.p(s), at.guess(s), at.force(s), at.halvings(s), Jx, Jf, at.past(s),
-                          ramp ? Jr : nullptr);
-    });
+    work.take(Parameters::of(parameters, at.n));
+    return at.derivatives(ramp ? at.n : 0, work.parameters(),
+                          [&](std::size_t s, double* Jx, double* Jf, double* Jr, double* Jp) {
+                              return work.first(at.h, at.q(s), at.p(s), at.guess(s), at.force(s), at.halvings(s), Jx,
+                                                Jf, at.past(s), ramp ? Jr : nullptr, Jp);
+                          });
 }
 
 // z . d2(q1, p1)/d(q0, p0, f)2 of each step (N, 3n, 3n), for the rows of z (N, 2n).
@@ -231,12 +233,15 @@ void register_rollouts(nb::module_& m) {
         .def("halvings", &Rollout::halvings, "path"_a)
         .def("impulses", &Rollout::impulses, "path"_a)
         .def("weakest", &Rollout::weakest, "path"_a);
+    nb::class_<Parameters>(m, "Parameters")
+        .def(nb::init<const std::vector<std::pair<const Mechanism*, const Mechanism*>>&, In<1>, In<3>>(), "pairs"_a,
+             "distance"_a, "gears"_a, nb::keep_alive<1, 2>());
     nb::class_<StepsAt>(m, "Steps")
         .def(nb::init<const Mechanism&, const Tableau&, double, const Guards&, double, In<2>, In<2>, In<3>, Integers<1>,
                       Bytes, In<3>>(),
              "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a, "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a,
              "halvings"_a, "guess"_a, nb::keep_alive<1, 2>())
-        .def("derivatives", &derivatives, "ramp"_a = false, "external"_a = false)
+        .def("derivatives", &derivatives, "ramp"_a = false, "external"_a = false, "parameters"_a.none() = nb::none())
         .def("curvatures", &curvatures, "z"_a)
         .def("ends", &ends);
 }

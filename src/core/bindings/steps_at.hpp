@@ -1,7 +1,9 @@
 // The steps of a trajectory that are repeated for their derivatives. docs/core.md, "The map".
 #pragma once
 
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
 
 #include <cstdint>
 #include <span>
@@ -12,8 +14,36 @@
 
 #include "arrays.hpp"
 #include "varpin/guards.hpp"
+#include "varpin/sensitivities.hpp"
 
 namespace varpin::border {
+
+// Parameters from pairs of mechanisms, whose owner keeps them alive, their distances, and the gears (k, 2, n).
+struct Parameters {
+    Parameters(const std::vector<std::pair<const Mechanism*, const Mechanism*>>& pairs, In<1> distance, In<3> gears) {
+        const std::size_t n = gears.shape(2);
+        require(distance, "distance", {pairs.size()});
+        require(gears, "gears", {pairs.size(), 2, n});
+        for (std::size_t k = 0; k < pairs.size(); ++k) {
+            const auto& [above, below] = pairs[k];
+            for (const Mechanism* each : {above, below}) {
+                if (static_cast<std::size_t>(each->dof()) != n)
+                    throw std::invalid_argument("a parameter's mechanisms must have as many coordinates as gears");
+            }
+            const double* gear = gears.data() + k * 2 * n;
+            all.push_back({above, below, distance(k), {gear, gear + n}, {gear + n, gear + 2 * n}});
+        }
+    }
+
+    std::vector<Parameter> all;
+
+    // Those of steps of n coordinates; empty for none.
+    static std::vector<Parameter> of(const Parameters* given, std::size_t n) {
+        if (given && !given->all.empty() && given->all[0].gear_above.size() != n)
+            throw std::invalid_argument("parameters must be of a mechanism with the coordinates of the steps");
+        return given ? given->all : std::vector<Parameter>();
+    }
+};
 
 class StepsAt {
   public:
@@ -86,15 +116,20 @@ class StepsAt {
         return {static_cast<std::int64_t>(Outcome::solved), N};
     }
 
-    // d(q1, p1)/d(q0, p0) (N, 2n, 2n), d(q1, p1)/df (N, 2n, n) and `more` further columns (N, 2n, more) of each step,
-    // and what `each` returns. first(step, Jx, Jf, Jr) writes the derivatives of one step.
+    // d(q1, p1)/d(q0, p0) (N, 2n, 2n), d(q1, p1)/df (N, 2n, n), `more` further columns (N, 2n, more) and those in
+    // `parameters` (N, 2n, k) of each step, and what `each` returns. first(step, Jx, Jf, Jr, Jp) writes the derivatives
+    // of one step.
     template <class First>
-    std::tuple<Out, Out, Out, std::int64_t, std::size_t> derivatives(std::size_t more, const First& first) const {
-        const Out X = array_for({N, 2 * n, 2 * n}), F = array_for({N, 2 * n, n}), R = array_for({N, 2 * n, more});
+    std::tuple<Out, Out, Out, Out, std::int64_t, std::size_t> derivatives(std::size_t more, std::size_t parameters,
+                                                                          const First& first) const {
+        const Out X = array_for({N, 2 * n, 2 * n}), F = array_for({N, 2 * n, n}), R = array_for({N, 2 * n, more}),
+                  P = array_for({N, 2 * n, parameters});
         const auto [outcome, done] = each([&](std::size_t s) {
-            return first(s, X.data() + s * 4 * n * n, F.data() + s * 2 * n * n, R.data() + s * 2 * n * more);
+            const std::size_t row = s * 2 * n;
+            return first(s, X.data() + row * 2 * n, F.data() + row * n, R.data() + row * more,
+                         parameters ? P.data() + row * parameters : nullptr);
         });
-        return {X, F, R, outcome, done};
+        return {X, F, R, P, outcome, done};
     }
 
   private:

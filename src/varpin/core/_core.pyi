@@ -159,6 +159,16 @@ class Rollout:
     def weakest(self, path: int) -> int:
         """The constraint row that was closest to dependence on the others at the end of a path."""
 
+class Parameters:
+    """Parameters of a mechanism; see src/core/include/varpin/sensitivities.hpp.
+
+    Each is a pair of mechanisms, above and below it, and their ``distance`` (k,). ``gears`` (k, 2, n) are the factors
+    by which forces of controls are greater there.
+    """
+
+    def __init__(self, pairs: Sequence[tuple[Mechanism, Mechanism]], distance: Floats, gears: Floats) -> None:
+        """Raises ValueError for arrays that do not fit each other."""
+
 class Steps:
     """The steps of a trajectory, to be repeated at dw = 0.
 
@@ -183,12 +193,14 @@ class Steps:
     ) -> None:
         """Raises ValueError for arrays that do not fit each other."""
 
-    def derivatives(self, ramp: bool = False, external: bool = False) -> tuple[Floats, Floats, Floats, int, int]:
+    def derivatives(
+        self, ramp: bool = False, external: bool = False, parameters: Parameters | None = None
+    ) -> tuple[Floats, Floats, Floats, Floats, int, int]:
         """Derivatives of steps, the outcome, and the number of steps done.
 
         They are those of (q1, p1) in (q0, p0) (N, 2n, 2n), in a constant force f (N, 2n, n), and with ``ramp`` in one
-        that grows linearly from 0 at the start of a step to f at its end (N, 2n, n), else (N, 2n, 0). ``external``: f
-        is not the force of the controls, which drives limit, but acts beside it.
+        that grows linearly from 0 at the start of a step to f at its end (N, 2n, n), else (N, 2n, 0), and in k
+        parameters (N, 2n, k). ``external``: f is not the force of the controls, which drives limit, but acts beside it.
         """
 
     def curvatures(self, z: Floats) -> tuple[Floats, int, int]:
@@ -198,9 +210,15 @@ class Steps:
         """Configurations and velocities (N, n) at the end of each step, the outcome, and the number of steps done."""
 
 def constrained_derivatives(
-    steps: Steps, *, places: Floats, rates: Floats, ramp: bool = False, external: bool = False
-) -> tuple[Floats, Floats, Floats, int, int]:
-    """Derivatives as of :meth:`Steps.derivatives`, and (N, 2n, i) in the rates (N, i) of driven joints.
+    steps: Steps,
+    *,
+    places: Floats,
+    rates: Floats,
+    ramp: bool = False,
+    external: bool = False,
+    parameters: Parameters | None = None,
+) -> tuple[Floats, Floats, Floats, Floats, int, int]:
+    """Derivatives as of :meth:`Steps.derivatives`; the third are those in the rates (N, i) of driven joints (N, 2n, i).
 
     With ``ramp`` those in the force are those in the one that grows.
     """

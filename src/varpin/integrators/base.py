@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -72,6 +72,14 @@ class Segment:
         values = {name: getattr(self, name)[:steps] for name in _ARRAYS}
         impulses = None if self.impulses is None else self.impulses[:steps]
         return Segment(**values, statistics=self.statistics.part(0, steps), impulses=impulses)
+
+
+class Varied(NamedTuple):
+    """A parameter: scenes with a greater and with a smaller value of it."""
+
+    above: Scene
+    below: Scene
+    distance: float  # between their values
 
 
 class Integrator(ABC):
@@ -224,6 +232,18 @@ class Integrator(ABC):
         Raises:
             LinearizationError: A step has no solution at dw = 0.
         """
+
+    def in_parameters(self, scene: Scene, trajectory: Trajectory, varied: Sequence[Varied]) -> Floats:  # noqa: ARG002
+        """Derivatives of each step at dw = 0 in P parameters (N, 2n, P), at fixed state and controls.
+
+        Raises:
+            InputError: The integrator does not provide them.
+            LinearizationError: A step has no solution at dw = 0.
+        """
+        raise InputError(
+            f"{self} has no derivatives in parameters; variational and explicit integrators have, such as "
+            "varpin.Midpoint()"
+        )
 
     def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:  # noqa: ARG002
         """Second derivatives sum_a z_a d2 x1_a of each step at dw = 0 in (x0, f), (N, 3n, 3n), for z (N, 2n).
@@ -470,6 +490,13 @@ def forces(scene: Scene, trajectory: Trajectory, drift: Floats | float = 0.0) ->
     u = trajectory.u_stages if trajectory.u_stages.shape[1] else trajectory.u[:, None]
     total = u if scene.direct else u @ scene.actuation.T
     return np.ascontiguousarray(total + drift if isinstance(drift, np.ndarray) else total)
+
+
+def gear(scene: Scene, other: Scene) -> Floats:
+    """Factors (n,) by which the controls of ``scene`` exert more force in the ``other``, whose servos are stiffer."""
+    before, after = (np.abs(each.actuation).sum(axis=1) for each in (scene, other))
+    factors: Floats = np.divide(after, before, out=np.ones_like(before), where=before > 0.0)
+    return factors
 
 
 def segments_of(nodes: RolloutArrays, reasons: Mapping[int, str], paths: Any = None) -> list[Segment]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,6 +13,7 @@ from varpin.arrays import Floats
 from varpin.core import (
     Guards,
     Outcome,
+    Parameters,
     Rollout,
     Steps,
     Tableau,
@@ -24,8 +26,10 @@ from varpin.integrators.base import (
     Integrator,
     Run,
     Segment,
+    Varied,
     drifts,
     forces,
+    gear,
     segments_of,
     without_inputs,
     written,
@@ -225,8 +229,15 @@ class Variational(Compiled):
         Divided steps are repeated in the same parts, and the derivatives of the parts are multiplied.
         """
         ramp = ramps and bool(self.stage_times)
-        Jx, Jf, Jr = self._derivatives(scene, trajectory, ramp=ramp)
+        Jx, Jf, Jr, _ = self._derivatives(scene, trajectory, ramp=ramp)
         return Jx, Jf, self._kicks(scene, trajectory, Jx, Jf), Jr if ramp else 0.5 * Jf
+
+    def in_parameters(self, scene: Scene, trajectory: Trajectory, varied: Sequence[Varied]) -> Floats:
+        """See :meth:`Integrator.in_parameters`."""
+        pairs = [(each.above.core, each.below.core) for each in varied]
+        gears = np.array([[gear(scene, each.above), gear(scene, each.below)] for each in varied])
+        distance = np.array([each.distance for each in varied])
+        return self._derivatives(scene, trajectory, parameters=Parameters(pairs, distance, gears))[3]
 
     def _kicks(self, scene: Scene, trajectory: Trajectory, Jx: Floats, Jf: Floats) -> Floats:
         """The derivatives in the noise impulse, from those in the state and in a constant force."""
@@ -243,26 +254,33 @@ class Variational(Compiled):
         return kicks
 
     def _derivatives(
-        self, scene: Scene, trajectory: Trajectory, *, ramp: bool = False, external: bool = False
-    ) -> tuple[Floats, Floats, Floats]:
-        """Derivatives of each step in (q, p), in a constant force, and with ``ramp`` in one that grows linearly from 0.
+        self,
+        scene: Scene,
+        trajectory: Trajectory,
+        *,
+        ramp: bool = False,
+        external: bool = False,
+        parameters: Parameters | None = None,
+    ) -> tuple[Floats, Floats, Floats, Floats]:
+        """Derivatives of each step in (q, p), in a constant force, in one that grows linearly from 0, in parameters.
 
-        Without ``ramp`` the last array is empty. With ``external`` the force is one that drives do not limit. The
+        Without ``ramp`` the third array is empty. With ``external`` the force is one that drives do not limit. The
         columns of velocities of cubic inputs follow those of the force, as in :attr:`Scene.transmission`.
         """
         steps = Steps(**self._steps(scene, trajectory))
         if scene.constraints:
             rates, cubic = _rates(scene, trajectory)
             given: dict[str, Any] = {"rates": rates, "places": self._places(scene), "external": external}
+            given["parameters"] = parameters
             found = []
             for growing in (False, True) if ramp else (False,):
-                Jx, Jf, by_rate, outcome, done = constrained_derivatives(steps, **given, ramp=growing)
+                Jx, Jf, by_rate, Jp, outcome, done = constrained_derivatives(steps, **given, ramp=growing)
                 _require_solved(trajectory, outcome, done)
                 found.append(np.concatenate([Jf, by_rate[:, :, cubic]], axis=2) if cubic else Jf)
-            return Jx, found[0], found[1] if ramp else Jf[:0]
-        Jx, Jf, Jr, outcome, done = steps.derivatives(ramp, external)
+            return Jx, found[0], found[1] if ramp else Jf[:0], Jp
+        Jx, Jf, Jr, Jp, outcome, done = steps.derivatives(ramp, external, parameters)
         _require_solved(trajectory, outcome, done)
-        return Jx, Jf, Jr
+        return Jx, Jf, Jr, Jp
 
     def _contract_by_differences(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
         """:meth:`contract` under constraints, by differences of z' J with exact derivatives J, scaled by M."""
@@ -285,7 +303,7 @@ class Variational(Compiled):
             by[:, cubic] += shift[:, 3 * n :]
             at = {"q": steps["q"] + shift[:, :n], "p": steps["p"] + shift[:, n : 2 * n]}
             at["force"] = steps["force"] + shift[:, None, 2 * n : 3 * n]
-            Jx, Jf, Jr, outcome, done = constrained_derivatives(Steps(**(steps | at)), places=places, rates=by)
+            Jx, Jf, Jr, _, outcome, done = constrained_derivatives(Steps(**(steps | at)), places=places, rates=by)
             _require_solved(trajectory, outcome, done)
             J = np.concatenate([Jx, Jf, Jr[:, :, cubic]], axis=2)
             found: Floats = np.einsum("Na,Nab->Nb", z, J)

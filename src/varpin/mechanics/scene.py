@@ -598,6 +598,16 @@ class Scene(Frozen):
         return controls
 
 
+def with_forces(scene: Scene, forces: Sequence[Force], robot: Robot) -> Scene:
+    """The scene with other numbers in its forces, and a robot of the same joints; its noise stays."""
+    values = _forces(robot, forces, 0.0, 0.0, 0.0, 0.0)
+    servos = {servo.coordinate: servo.values[0] for servo in of_kind(values["elements"], "PositionServo")}
+    actuation = scene.actuation.copy()
+    for before in scene._servos:
+        actuation[before.coordinate] *= servos.get(before.coordinate, 0.0) / before.values[0]
+    return scene.changed(robot=robot, actuation=actuation, **values)
+
+
 def quiet(scene: Scene) -> Scene:
     """The scene without its noise."""
     return scene.changed(noise=bind((), scene.actuation, ())) if scene.processes else scene

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -90,6 +90,35 @@ def inertials_of(model: pin.Model) -> list[Inertial]:
     links = {frame.parentJoint: frame.name for frame in reversed(model.frames) if frame.type == pin.FrameType.BODY}
     bodies = list(enumerate(model.inertias))[1:]
     return [Inertial(links.get(j, model.names[j]), x.mass, np.array(x.lever), np.array(x.inertia)) for j, x in bodies]
+
+
+def inertial_numbers(robot: Robot, link: str) -> tuple[int, Floats]:
+    """The joint of the body that a link is part of, and the body's m, m c and moments about the joint's origin (10,).
+
+    Raises:
+        UnknownFrame: There is no such link.
+        InputError: The link belongs to the base.
+    """
+    joint = robot.model.frames[frame_index(robot.model, link, robot.name)].parentJoint
+    if joint == 0:
+        raise InputError(f"link {link!r} of robot {robot.name!r} belongs to the base, which does not move")
+    return joint, np.array(robot.model.inertias[joint].toDynamicParameters())
+
+
+def point_mass(robot: Robot, frame: str) -> tuple[int, Floats]:
+    """The joint that moves a frame, and the numbers (10,) of :func:`inertial_numbers` of 1 kg at its origin."""
+    joint, _ = inertial_numbers(robot, frame)
+    place = robot.model.frames[frame_index(robot.model, frame, robot.name)].placement
+    return joint, np.array(pin.Inertia(1.0, place.translation, np.zeros((3, 3))).toDynamicParameters())
+
+
+def with_inertial_numbers(robot: Robot, added: Mapping[int, Floats]) -> Robot:
+    """The robot with numbers (10,) of :func:`inertial_numbers` added to bodies by joint; they are not checked."""
+    model = robot.model.copy()
+    for joint, numbers in added.items():
+        both = np.array(model.inertias[joint].toDynamicParameters()) + numbers
+        model.inertias[joint] = pin.Inertia.FromDynamicParameters(both)
+    return robot.changed(model=model, inertials=())
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,10 +5,13 @@
 #include <array>
 #include <cmath>
 #include <cstdint>
+#include <optional>
 #include <span>
+#include <utility>
 #include <vector>
 
 #include "varpin/constrained.hpp"
+#include "varpin/sensitivities.hpp"
 #include "varpin/substeps.hpp"
 
 namespace varpin {
@@ -28,27 +31,38 @@ class ConstrainedLinearization {
           state(mechanism, stages),
           chained(n, inputs.count()) {}
 
+    // Parameters in which `first` takes derivatives.
+    void take(std::vector<Parameter> parameters) {
+        by_parameter.emplace(stepper.equation, std::move(parameters));
+        in_parameters.resize(entries(2 * n, by_parameter->count()));
+    }
+    std::size_t parameters() const { return by_parameter->parameters.size(); }
+
     // With `ramp` those in the force are in one that grows linearly from 0; `rates` are those of kinematic inputs at
-    // their goals, and Jr (2n, driven rows) the derivatives in them, zero for linear ones.
+    // their goals, and Jr (2n, driven rows) the derivatives in them, zero for linear ones; Jp (2n, k), unless null,
+    // those in the parameters.
     Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
-                  const double* rates, std::span<const std::uint8_t> halvings, double* Jx, double* Jf, double* Jr) {
+                  const double* rates, std::span<const std::uint8_t> halvings, double* Jx, double* Jf, double* Jr,
+                  double* Jp = nullptr) {
         stepper.take_force(force, varies, rates);
         if (!stepper.begin_at(q, p, state, false)) return Outcome::singular;
         if (halvings.empty()) {
             Outcome outcome = stepper.from_guess(h, guess, state);
             if (outcome != Outcome::solved) outcome = stepper.part(h, 0, 0.0, state);
-            if (outcome == Outcome::solved) derivatives(h, 0.0, 1.0, Jx, Jf, Jr);
+            if (outcome == Outcome::solved) derivatives(h, 0.0, 1.0, Jx, Jf, Jr, Jp);
             if (outcome == Outcome::solved || !stepper.guards.active) return outcome;
         }
         chained.begin(Jx, Jf);
         std::fill(Jr, Jr + chained.part_rate.size(), 0.0);
+        if (Jp) std::fill(Jp, Jp + in_parameters.size(), 0.0);
         return parts_again(halvings, stepper.guards.halvings_again(), [&](int level, double begin) {
             const Outcome outcome = stepper.part(h, level, begin, state);
             if (outcome != Outcome::solved) return outcome;
             derivatives(length_of(h, level), begin, length_of(1.0, level), chained.part.data(), chained.part_f.data(),
-                        chained.part_rate.data());
+                        chained.part_rate.data(), Jp ? in_parameters.data() : nullptr);
             chained.follow(Jx, Jf);
             chained.follow_rates(Jr);
+            if (Jp) chained.follow_more(Jp, in_parameters);
             return outcome;
         });
     }
@@ -67,11 +81,15 @@ class ConstrainedLinearization {
     PathState state;
     ChainedDerivatives chained;
     std::array<std::vector<double>, 2> by_rates;  // (2n, 2n) and (2n, n), derivatives in rates at both ends
-    std::vector<double> dV, columns, bends, y = zeros(n);
+    std::optional<ParameterColumns> by_parameter;
+    std::vector<double> in_parameters;  // (2n, k) of a part
+    std::vector<double> dV, columns, bends, y = zeros(n), shift = zeros(n);
+    std::vector<double> at = zeros(n), bend = zeros(m, n), curvature = zeros(n, n);  // at the end
 
     // Derivatives of the last substep, from (q0, p0) under the force f: of (q1, p1) in (q0, p0), Jx, in f, Jf, and in
-    // the rates of kinematic inputs at their goals, Jr. It is the part of the step at `begin` with length `share`.
-    void derivatives(double h, double begin, double share, double* Jx, double* Jf, double* Jr) {
+    // the rates of kinematic inputs at their goals, Jr, and in parameters, Jp. It is the part of the step at `begin`
+    // with length `share`.
+    void derivatives(double h, double begin, double share, double* Jx, double* Jf, double* Jr, double* Jp) {
         if (ramp) stepper.equation.weigh_ramp(begin, share);
         swap(here, stepper.origin);
         stepper.assemble(h);
@@ -84,12 +102,15 @@ class ConstrainedLinearization {
             by_rates[end].resize(6 * n * n);
             end_columns(h, by_rates[end].data(), by_rates[end].data() + 4 * n * n);
         }
+        if (Jp) parameter_columns(h, Jp);
         swap(here, stepper.origin);
+        look_at_end();
         project(h, Goal::position, Jx, Jf);
+        if (Jp) project_parameters(Jp);
         if (!inputs.cubic) return;
         for (int end = 0; end < 2; ++end)
             project(h, end == 0 ? Goal::begin : Goal::end, by_rates[end].data(), by_rates[end].data() + 4 * n * n);
-        join_rates(Jx, Jr);
+        join_rates(Jx, Jr, Jp);
     }
 
     // Lam_k . g_qq (s, n, n) at the Lobatto points but the last.
@@ -167,24 +188,57 @@ class ConstrainedLinearization {
             for (int c = 0; c < w; ++c) dV[i * w + c] = stepper.scaled[i % n] * sorted[i * w + c];
         }
         stepper.equation.end_derivatives(n, stages, h, {0, n}, dV, Jx, Jf);
-        // The impulses up to the last one contribute C_k' dLam_k + Lam_k . g_qq dQ~_k.
+        for (int c = 0; c < w; ++c)
+            subtract_impulses(h, &dV[c], &sorted[wide * w + c], w, c,
+                              [&](int i) -> double& { return entry(Jx, Jf, n + i, c); });
+    }
+
+    // The impulses up to the last one take C_k' dLam_k + Lam_k . g_qq dQ~_k from dp1. Rows of dV and dLam are `w`
+    // apart; coordinate `own` of q0 moves by 1.
+    template <class End>
+    void subtract_impulses(double h, const double* dV, const double* dLam, int w, int own, const End& dp) const {
+        const int r = here.rank();
         std::vector<double> dQ(n);
-        for (int c = 0; c < w; ++c) {
-            for (int k = 0; k < stages; ++k) {
-                for (int i = 0; i < n; ++i) {
-                    double sum = 0.0;
-                    for (int j = 0; j < stages; ++j) sum += stepper.places[k * stages + j] * dV[(j * n + i) * w + c];
-                    dQ[i] = h * sum + (c == i ? 1.0 : 0.0);
+        for (int k = 0; k < stages; ++k) {
+            for (int i = 0; i < n; ++i) {
+                double sum = 0.0;
+                for (int j = 0; j < stages; ++j) sum += stepper.places[k * stages + j] * dV[(j * n + i) * w];
+                dQ[i] = h * sum + (own == i ? 1.0 : 0.0);
+            }
+            for (int i = 0; i < n; ++i) {
+                double sum = detail::inner(n, &bends[(k * n + i) * n], dQ.data());
+                for (int a = 0; a < r; ++a) {
+                    const int row = here.order[a];
+                    sum += stepper.jet_at(k).C[row * n + i] * stepper.row_scale[row] * dLam[(k * r + a) * w];
                 }
-                for (int i = 0; i < n; ++i) {
-                    double sum = detail::inner(n, &bends[(k * n + i) * n], dQ.data());
-                    for (int a = 0; a < r; ++a) {
-                        const int row = here.order[a];
-                        sum += stepper.jet_at(k).C[row * n + i] * stepper.row_scale[row] *
-                               sorted[(wide + k * r + a) * w + c];
-                    }
-                    entry(Jx, Jf, n + i, c) -= sum;
-                }
+                dp(i) -= sum;
+            }
+        }
+    }
+
+    // Derivatives in the parameters of the end of a substep without its last impulse, from the factors of the bordered
+    // matrix.
+    void parameter_columns(double h, double* Jp) {
+        const int r = here.rank(), wide = stages * n, size = stages * (n + r), w = by_parameter->count();
+        std::vector<double> right, dp, dq(n), by(size), sorted(entries(size, w));
+        for (int a = 0; a < w; ++a) {
+            by_parameter->right_side(a, h, stepper.force.data(), stepper.stride, right, dp);
+            for (int i = 0; i < size; ++i) {
+                const int from = stepper.rows[i];
+                sorted[i * w + a] = from < wide ? stepper.scaled[from % n] * right[from] : 0.0;
+            }
+            for (int i = 0; i < n; ++i) Jp[(n + i) * w + a] = dp[i];
+        }
+        solve_lu_rows(stepper.saddle.data(), size, {0, size}, sorted.data(), w, w);
+        for (int a = 0; a < w; ++a) {
+            for (int i = 0; i < size; ++i) by[i] = (i < wide ? stepper.scaled[i % n] : 1.0) * sorted[i * w + a];
+            std::fill(dq.begin(), dq.end(), 0.0);
+            std::fill(dp.begin(), dp.end(), 0.0);
+            stepper.equation.add_end_change(h, by.data(), dq.data(), dp.data());
+            subtract_impulses(h, by.data(), &by[wide], 1, -1, [&](int i) -> double& { return dp[i]; });
+            for (int i = 0; i < n; ++i) {
+                Jp[i * w + a] = dq[i];
+                Jp[(n + i) * w + a] += dp[i];
             }
         }
     }
@@ -193,40 +247,65 @@ class ConstrainedLinearization {
         return c < 2 * n ? Jx[row * 2 * n + c] : Jf[row * n + c - 2 * n];
     }
 
-    // The last impulse: M dv1 + C1' dLam = dp - (L_vq + Lam . g_qq) dq1, C1 dv1 = -(g_qq v1) dq1, and dp1 = M dv1 +
-    // L_vq dq1.
-    void project(double h, Goal what, double* Jx, double* Jf) {
-        const int r = here.rank();
-        std::vector<double> at(n), bend(m * n), curvature(n * n), z(n), along(r), dq(n), turned(n);
+    // The jet and the constraints at the end.
+    void look_at_end() {
+        for (auto* sum : {&bend, &curvature}) std::fill(sum->begin(), sum->end(), 0.0);
         for (int i = 0; i < n; ++i) at[i] = state.position[i].value.high;
         Jet<double>& jet = stepper.equation.stage[0];
         stepper.equation.kernels.jet(stepper.mechanism, at.data(), state.v.data(), jet);
         stepper.mechanism.constraints.bend(state.v.data(), here.jet, bend.data());
         stepper.mechanism.constraints.add_curvature(stepper.last.data(), 1.0, here.jet, curvature.data());
+    }
+
+    void project(double h, Goal what, double* Jx, double* Jf) {
+        std::vector<double> dq(n);
+        std::fill(shift.begin(), shift.end(), 0.0);
         for (int c = 0; c < 3 * n; ++c) {
             for (int i = 0; i < n; ++i) dq[i] = entry(Jx, Jf, i, c);
-            for (int i = 0; i < n; ++i) {
-                turned[i] = detail::inner(n, &jet.A[i * n], dq.data());
-                z[i] = entry(Jx, Jf, n + i, c) - turned[i] - detail::inner(n, &curvature[i * n], dq.data());
-            }
-            here.whiten(z.data(), z.data());
-            for (int k = 0; k < r; ++k) {
-                double own =
-                    -detail::inner(n, &bend[here.order[k] * n], dq.data()) + goal_rate(here.order[k], what, h, c);
-                for (int j = 0; j < k; ++j) own -= here.R[j * r + k] * along[j];
-                along[k] = own / here.R[k * r + k];
-            }
-            const std::vector<double> before = z;
-            for (int k = 0; k < r; ++k) {
-                const double change = along[k] - detail::inner(n, &here.Q[k * n], before.data());
-                for (int i = 0; i < n; ++i) z[i] += change * here.Q[k * n + i];
-            }
-            for (int i = 0; i < n; ++i) z[i] *= std::sqrt(here.ldl[i * n + i]);
-            for (int i = n - 1; i >= 0; --i) {
-                double sum = z[i];
-                for (int j = 0; j < i; ++j) sum += here.ldl[i * n + j] * z[j];
-                entry(Jx, Jf, n + i, c) = sum + turned[i];
-            }
+            project_column(
+                dq, shift, [&](int row) { return goal_rate(row, what, h, c); },
+                [&](int i) -> double& { return entry(Jx, Jf, n + i, c); });
+        }
+    }
+
+    void project_parameters(double* Jp) {
+        const int w = by_parameter->count();
+        std::vector<double> dq(n);
+        for (int a = 0; a < w; ++a) {
+            for (int i = 0; i < n; ++i) dq[i] = Jp[i * w + a];
+            by_parameter->momentum(a, at.data(), state.v.data(), shift);
+            project_column(dq, shift, [](int) { return 0.0; }, [&](int i) -> double& { return Jp[(n + i) * w + a]; });
+        }
+    }
+
+    // The last impulse: M dv1 + C1' dLam = dp - (L_vq + Lam . g_qq) dq1 - dM v1, C1 dv1 = -(g_qq v1) dq1, and dp1 =
+    // M dv1 + L_vq dq1 + dM v1, with the derivative of a row's rate and dM v1, `shift` (n).
+    template <class Rate, class End>
+    void project_column(const std::vector<double>& dq, const std::vector<double>& shift, const Rate& rate,
+                        const End& dp) const {
+        const int r = here.rank();
+        const Jet<double>& jet = stepper.equation.stage[0];
+        std::vector<double> z(n), along(r), turned(n);
+        for (int i = 0; i < n; ++i) {
+            turned[i] = detail::inner(n, &jet.A[i * n], dq.data()) + shift[i];
+            z[i] = dp(i) - turned[i] - detail::inner(n, &curvature[i * n], dq.data());
+        }
+        here.whiten(z.data(), z.data());
+        for (int k = 0; k < r; ++k) {
+            double own = -detail::inner(n, &bend[here.order[k] * n], dq.data()) + rate(here.order[k]);
+            for (int j = 0; j < k; ++j) own -= here.R[j * r + k] * along[j];
+            along[k] = own / here.R[k * r + k];
+        }
+        const std::vector<double> before = z;
+        for (int k = 0; k < r; ++k) {
+            const double change = along[k] - detail::inner(n, &here.Q[k * n], before.data());
+            for (int i = 0; i < n; ++i) z[i] += change * here.Q[k * n + i];
+        }
+        for (int i = 0; i < n; ++i) z[i] *= std::sqrt(here.ldl[i * n + i]);
+        for (int i = n - 1; i >= 0; --i) {
+            double sum = z[i];
+            for (int j = 0; j < i; ++j) sum += here.ldl[i * n + j] * z[j];
+            dp(i) = sum + turned[i];
         }
     }
 
@@ -243,7 +322,7 @@ class ConstrainedLinearization {
 
     // Write the derivatives in the rates at the goals, and add those by way of the rates at the beginning, which follow
     // from the momentum: v = M^-1 p, M dv = dp - L_vq dq.
-    void join_rates(double* Jx, double* Jr) {
+    void join_rates(double* Jx, double* Jr, double* Jp) {
         const std::vector<DrivenRow>& driven = inputs.driven;
         Jet<double>& jet = stepper.equation.stage[0];
         stepper.equation.kernels.jet(stepper.mechanism, stepper.from_q.data(), stepper.from_v.data(), jet);
@@ -264,6 +343,11 @@ class ConstrainedLinearization {
                     Jx[i * 2 * n + c] += at_begin[i * n + moved] * by_q;
                     Jx[i * 2 * n + n + c] += at_begin[i * n + moved] * y[c];
                 }
+            }
+            for (int a = 0; Jp && a < by_parameter->count(); ++a) {
+                by_parameter->momentum(a, stepper.from_q.data(), stepper.from_v.data(), shift);
+                const double by = -detail::inner(n, y.data(), shift.data());
+                for (int i = 0; i < 2 * n; ++i) Jp[i * by_parameter->count() + a] += at_begin[i * n + moved] * by;
             }
         }
     }

@@ -8,9 +8,12 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <optional>
 #include <span>
+#include <utility>
 #include <vector>
 
+#include "varpin/sensitivities.hpp"
 #include "varpin/substeps.hpp"
 #include "varpin/variational.hpp"
 
@@ -41,28 +44,43 @@ class VariationalLinearization {
 
     bool varies = false;  // each step has forces (s, n) at its stages instead of a constant force (n)
 
+    // Parameters in which `first` takes derivatives.
+    void take(std::vector<Parameter> parameters) {
+        columns.emplace(stepper.equation, std::move(parameters));
+        in_parameters.resize(entries(2 * n, columns->count()));
+    }
+    std::size_t parameters() const { return columns->parameters.size(); }
+
     // Take derivatives in an external force in the place of f, which drives limit.
     void take_external() { stepper.equation.by_external = true; }
 
     // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a force f, and unless null
-    // Jr (2n, n) in a force that grows linearly from 0 at the start of the step to f at its end. An undivided step
+    // Jr (2n, n) in a force that grows linearly from 0 at the start of the step to f at its end, and Jp (2n, k) in the
+    // parameters. An undivided step
     // is solved again from a guess (s, n) close to its root; the arrays q, p and force have `past` earlier steps before
     // the pointers. A divided step has `halvings`: its parts are repeated, and their derivatives are multiplied.
     Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
-                  std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past = 0, double* Jr = nullptr) {
+                  std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past = 0, double* Jr = nullptr,
+                  double* Jp = nullptr) {
         if (halvings.empty() && !stepper.guards.active) {
             const Outcome outcome = root(h, q, p, guess, force, past);
             if (outcome == Outcome::solved) {
                 stepper.equation.derivatives(h, dV, Jx, Jf);
                 if (Jr) ramp_derivatives(h, 0.0, 1.0, Jr);
+                if (Jp) parameter_derivatives(h, Jp);
             }
             return outcome;
         }
         chained.begin(Jx, Jf);
         if (Jr) std::fill(Jr, Jr + entries(2 * n, n), 0.0);
+        if (Jp) std::fill(Jp, Jp + in_parameters.size(), 0.0);
         return parts(h, q, p, force, halvings, [&](double begin, double length) {
             part_derivatives(length);
             chained.follow(Jx, Jf);
+            if (Jp) {
+                parameter_derivatives(length, in_parameters.data());
+                chained.follow_more(Jp, in_parameters);
+            }
             if (!Jr) return;
             ramp_derivatives(length, begin, length / h, chained.part_rate.data());
             chained.follow_rates(Jr);
@@ -129,6 +147,8 @@ class VariationalLinearization {
     std::vector<double> dV = zeros(stages * n, 3 * n);
     std::vector<double> dQ = zeros(n, 3 * n);  // of one stage
     ChainedDerivatives chained;
+    std::optional<ParameterColumns> columns;
+    std::vector<double> in_parameters;                  // (2n, k) of a part
     std::vector<double> in_ramp = zeros(2 * n, 2 * n);  // derivatives in the state again, which nobody reads
     std::vector<double> multiplier = zeros(stages, n), slope = zeros(stages, n);
     Jet<Dual> direction;
@@ -218,6 +238,22 @@ class VariationalLinearization {
         stepper.equation.weigh_ramp(begin, share);
         stepper.equation.derivatives(h, dV, in_ramp.data(), Jr);
         stepper.equation.weigh_constant();
+    }
+
+    // Derivatives (2n, k) in the parameters, of the part whose root and factors are in the stepper.
+    void parameter_derivatives(double h, double* Jp) {
+        const int k = columns->count();
+        std::vector<double> right, dp, dq(n), by(stages * n);
+        for (int a = 0; a < k; ++a) {
+            columns->right_side(a, h, stepper.force.data(), stepper.stride, right, dp);
+            stepper.equation.solve_factored(right.data(), by.data());
+            std::fill(dq.begin(), dq.end(), 0.0);
+            stepper.equation.add_end_change(h, by.data(), dq.data(), dp.data());
+            for (int r = 0; r < n; ++r) {
+                Jp[r * k + a] = dq[r];
+                Jp[(n + r) * k + a] = dp[r];
+            }
+        }
     }
 
     // Derivatives of the part whose root is in the stepper.

@@ -66,6 +66,27 @@ class StepEquation : public Collocation {
         });
     }
 
+    // Add what a change dV (s, n) of the stage velocities gives to the end of the step, (L1) and (L2).
+    void add_end_change(double h, const double* dV, double* dq, double* dp) {
+        std::vector<double> dQ(n);
+        for (int i = 0; i < stages; ++i) {
+            const double* own = dV + i * n;
+            std::fill(dQ.begin(), dQ.end(), 0.0);
+            for (int j = 0; j < stages; ++j) {
+                for (int c = 0; c < n; ++c) dQ[c] += h * tableau.a[i * stages + j] * dV[j * n + c];
+            }
+            for (int r = 0; r < n; ++r) {
+                const JointForce<double>& force = acting[i * n + r];
+                double total = force.by_q * dQ[r] + force.by_v * own[r];
+                for (int c = 0; c < n; ++c) total += stage[i].Lqq[r * n + c] * dQ[c] + stage[i].A[c * n + r] * own[c];
+                for (int c = 0; c < n && coupled(); ++c)
+                    total += coupled_q[(i * n + r) * n + c] * dQ[c] + coupled_v[(i * n + r) * n + c] * own[c];
+                dq[r] += h * tableau.b[i] * own[r];
+                dp[r] += h * tableau.b[i] * total;
+            }
+        }
+    }
+
     // How many of q0, p0 and f need a solve. With one stage, the columns of the force are proportional to those of the
     // momentum, unless `every_kind` is set.
     int kinds() const { return stages == 1 && !every_kind ? 2 : 3; }

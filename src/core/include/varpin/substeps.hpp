@@ -94,9 +94,11 @@ class ChainedDerivatives {
     }
 
     // Multiply by the derivatives of the last part; follow_rates does so for derivatives in rates (2n, rates).
-    void follow_rates(double* Jr) {
-        times(rates, Jr);
-        for (int i = 0; i < 2 * n * rates; ++i) Jr[i] += part_rate[i];
+    void follow_rates(double* Jr) { follow_more(Jr, part_rate); }
+    // As follow_rates, with those of the last part in any further `columns` (2n, k).
+    void follow_more(double* J, const std::vector<double>& columns) {
+        times(static_cast<int>(columns.size()) / (2 * n), J);
+        for (std::size_t i = 0; i < columns.size(); ++i) J[i] += columns[i];
     }
     void follow(double* Jx, double* Jf) {
         times(2 * n, Jx);
@@ -109,6 +111,7 @@ class ChainedDerivatives {
 
     void times(int columns, double* right) {
         const int x = 2 * n;
+        product_.resize(entries(x, std::max(columns, x)));
         std::fill(product_.begin(), product_.begin() + x * columns, 0.0);
         for (int i = 0; i < x; ++i) {
             for (int j = 0; j < x; ++j) {

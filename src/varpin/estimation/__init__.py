@@ -1,0 +1,1 @@
+"""What logs say: sensitivities, identification, filter and smoother."""

@@ -1,0 +1,193 @@
+"""Derivatives of a motion in parameters of its scene.
+
+Equation (L5) of docs/mathematics.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from varpin.arrays import Floats
+from varpin.errors import InputError
+from varpin.estimation.parameters import parameters_of
+from varpin.integrators.base import Integrator, Varied
+from varpin.linearization import linearize, matching_integrator, node_jets, velocity_at_nodes
+from varpin.mechanics.scene import Scene, require_scene
+from varpin.support.checks import finite_array
+from varpin.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Gradient:
+    """The gradient of a loss of a motion.
+
+    Attributes:
+        parameters: In the parameters (P,), with q0, v0 and the controls fixed.
+        q0: In the first configuration (n,), with v0 fixed.
+        v0: In the first velocity (n,).
+        u: In the controls (N, m), each constant over its step.
+    """
+
+    parameters: Floats
+    q0: Floats
+    v0: Floats
+    u: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivities:
+    """Derivatives of a motion of N steps in P parameters, with q0, v0 and the controls fixed.
+
+    Attributes:
+        names: Names of the parameters (P,).
+        values: Their values (P,).
+        q: Derivatives of the configurations (N + 1, n, P).
+        v: Of the velocities (N + 1, n, P).
+        p: Of the momenta (N + 1, n, P).
+        q0: Derivatives of the state (q, v) at the nodes in the first configuration (N + 1, 2n, n), with v0 fixed.
+        v0: The same in the first velocity (N + 1, 2n, n).
+    """
+
+    names: tuple[str, ...]
+    values: Floats
+    q: Floats
+    v: Floats
+    p: Floats
+    _map: _Map
+
+    def __repr__(self) -> str:
+        nodes, n, P = self.q.shape
+        return f"Sensitivities({nodes} nodes, {n} joints, {P} parameters)"
+
+    @property
+    def start(self) -> Floats:
+        """Derivatives of (q, v) at the nodes in (q0, v0) (N + 1, 2n, 2n)."""
+        of = self._map
+        begin = np.concatenate([of.by_q0, of.by_v0], axis=1)
+        return of.in_velocities(of.forward(begin, None))
+
+    def gradient(
+        self, loss_q: ArrayLike | None = None, *, loss_v: ArrayLike | None = None, loss_p: ArrayLike | None = None
+    ) -> Gradient:
+        """The gradient of a loss of the motion by one adjoint pass: what it costs does not grow with P.
+
+        Args:
+            loss_q: Derivatives of the loss in the configurations at the nodes (N + 1, n); zero if left out.
+            loss_v: In the velocities (N + 1, n).
+            loss_p: In the momenta (N + 1, n).
+
+        Raises:
+            InputError: A shape is wrong, or a value is not finite.
+        """
+        shape = self.q.shape[:2]
+        given = {"loss_q": loss_q, "loss_v": loss_v, "loss_p": loss_p}
+        in_q, in_v, in_p = (
+            np.zeros(shape) if loss is None else finite_array(name, loss, shape) for name, loss in given.items()
+        )
+        return self._map.backward(in_q, in_v, in_p)
+
+
+@dataclass(frozen=True, eq=False)
+class _Map:
+    """The linear map from parameters, start and controls to nodes: x' = A x + B u + D theta."""
+
+    A: Floats  # (N, 2n, 2n)
+    B: Floats  # (N, 2n, m)
+    D: Floats  # (N, 2n, P)
+    by_q0: Floats  # (2n, n) of x at the start
+    by_v0: Floats  # (2n, n)
+    by_theta: Floats  # (2n, P)
+    other: Floats  # (N + 1, n, 2n) of v in (q, p), or of p in (q, v)
+    shift: Floats  # (N + 1, n, P) of v at fixed (q, p), or of p at fixed (q, v)
+    variational: bool
+
+    def forward(self, x: Floats, D: Floats | None) -> Floats:
+        """States (N + 1, 2n, k) from the first (2n, k)."""
+        states = np.empty((len(self.A) + 1, *x.shape))
+        states[0] = x
+        for j, A in enumerate(self.A):
+            states[j + 1] = A @ states[j] if D is None else A @ states[j] + D[j]
+        return states
+
+    def in_velocities(self, x: Floats) -> Floats:
+        """(q, v) of states (N + 1, 2n, k) at fixed parameters."""
+        n = self.other.shape[1]
+        return np.concatenate([x[:, :n], self.other @ x], axis=1) if self.variational else x
+
+    def backward(self, in_q: Floats, in_v: Floats, in_p: Floats) -> Gradient:
+        own, else_ = (in_p, in_v) if self.variational else (in_v, in_p)
+        loss = np.concatenate([in_q, own], axis=1) + np.einsum("ka,kab->kb", else_, self.other)
+        theta = np.einsum("ka,kap->p", else_, self.shift)
+        row, u = loss[-1], np.empty((len(self.B), self.B.shape[2]))
+        for j in range(len(self.A) - 1, -1, -1):
+            u[j], theta = row @ self.B[j], theta + row @ self.D[j]
+            row = loss[j] + row @ self.A[j]
+        return Gradient(theta + row @ self.by_theta, row @ self.by_q0, row @ self.by_v0, u)
+
+
+def sensitivities(
+    scene: Scene, motion: Trajectory, parameters: str | Sequence[str], *, integrator: Integrator | None = None
+) -> Sensitivities:
+    """Exact derivatives of a motion in parameters of its scene.
+
+    They are those of the discrete map, step by step beside the linearization: x_theta' = A x_theta + dx'/dtheta, where
+    dx'/dtheta solves the factored step equation of A and B.
+
+    Main args:
+        scene: The scene of the motion; constraints and kinematic inputs are no obstacle.
+        motion: From :func:`varpin.simulate`, without noise. Its controls are held as they were.
+        parameters: Names, see :func:`varpin.estimation.parameters.parameters_of`: ``"damping"``,
+            ``"friction:elbow_joint"``, ``"payload"``, ``"inertia:wrist_3_link"``.
+
+    Other Args:
+        integrator: As for :func:`varpin.linearize`.
+
+    Raises:
+        InputError: As :func:`varpin.linearize`; the motion has noise; a name stands for no parameter; or the integrator
+            has no derivatives in parameters.
+        LinearizationError: A step has no solution.
+    """
+    if motion.noisy:
+        raise InputError("sensitivities are of a motion without noise, and this one has it: simulate it without rng=")
+    of = parameters_of(require_scene(scene), parameters)
+    linear = linearize(scene, motion, integrator=integrator)
+    chosen = matching_integrator(scene, motion, integrator)
+    varied = of.varied()
+    D = chosen.in_parameters(scene, motion, varied)
+    by = _map(scene, motion, varied, (linear.A, linear.B, D), variational=chosen.variational)
+    x, n = by.forward(by.by_theta, D), scene.robot.dof
+    other = by.other @ x + by.shift
+    v, p = (other, x[:, n:]) if chosen.variational else (x[:, n:], other)
+    return Sensitivities(of.names, of.values, x[:, :n], v, p, by)
+
+
+def _map(
+    scene: Scene,
+    motion: Trajectory,
+    varied: Sequence[Varied],
+    steps: tuple[Floats, Floats, Floats],
+    *,
+    variational: bool,
+) -> _Map:
+    q, v = (np.ascontiguousarray(x) for x in (motion.q, motion.v))
+    M, Lvq = node_jets(scene, q, v)
+    pull = np.stack([momentum_change(each, q, v) for each in varied], axis=2)
+    n, none = scene.robot.dof, np.zeros((scene.robot.dof, len(varied)))
+    one, zero = np.eye(n), np.zeros((n, n))
+    if variational:
+        other = velocity_at_nodes(scene, q, v)
+        begin = (np.vstack([one, Lvq[0]]), np.vstack([zero, M[0]]), np.vstack([none, pull[0]]))
+        return _Map(*steps, *begin, other, -other[:, :, n:] @ pull, variational=True)
+    begin = (np.vstack([one, zero]), np.vstack([zero, one]), np.vstack([none, none]))
+    return _Map(*steps, *begin, np.concatenate([Lvq, M], axis=2), pull, variational=False)
+
+
+def momentum_change(varied: Varied, q: Floats, v: Floats) -> Floats:
+    """The derivative of p = M v in a parameter at nodes (N, n)."""
+    above, below = (node_jets(scene, q, v)[0] for scene in (varied.above, varied.below))
+    change: Floats = np.einsum("kij,kj->ki", above - below, v) / varied.distance
+    return change
