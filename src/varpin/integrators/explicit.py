@@ -11,7 +11,7 @@ import scipy
 from varpin import core
 from varpin.arrays import Floats
 from varpin.core import ExplicitMethod, Outcome
-from varpin.core.arrays import Commands, new_nodes
+from varpin.core.arrays import Commands, FilterArrays, FilterLog, new_nodes
 from varpin.errors import LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
     Compiled,
@@ -81,6 +81,10 @@ class _Explicit(Compiled):
         if done < len(q):
             raise LinearizationError(done, done * h, REASONS[Outcome.singular])
         return Jx, Jf
+
+    def filtered(self, scene: Scene, log: FilterLog) -> FilterArrays:
+        """See :meth:`Integrator.filtered`; the state is (q, v)."""
+        return self._reached(core.filter_explicit(scene.core, self.method, log), log, REASONS)
 
     def _jump(self, in_v: Floats) -> Floats:
         """Derivatives of each step in a jump (N, 2n, n), from those in the velocity."""
