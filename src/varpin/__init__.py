@@ -147,9 +147,13 @@ if TYPE_CHECKING:
     from varpin.ensemble import EnsembleStatistics as EnsembleStatistics
     from varpin.ensemble import PathFailure as PathFailure
     from varpin.ensemble import simulate_ensemble as simulate_ensemble
-    from varpin.estimation.sensitivities import Gradient as Gradient
-    from varpin.estimation.sensitivities import Sensitivities as Sensitivities
-    from varpin.estimation.sensitivities import sensitivities as sensitivities
+    from varpin.estimation import Estimate as Estimate
+    from varpin.estimation import Gradient as Gradient
+    from varpin.estimation import Log as Log
+    from varpin.estimation import Sensitivities as Sensitivities
+    from varpin.estimation import kalman_filter as kalman_filter
+    from varpin.estimation import sensitivities as sensitivities
+    from varpin.estimation import smooth as smooth
     from varpin.io.scenefile import SceneFile as SceneFile
     from varpin.io.scenefile import SceneFileError as SceneFileError
     from varpin.io.scenefile import load_scene as load_scene
@@ -201,7 +205,7 @@ _LATE = {
     ),
     "varpin.control.mpc": "Mpc MpcRun Plant",
     "varpin.ensemble": ("Ensemble EnsembleInterrupted EnsembleStatistics PathFailure simulate_ensemble"),
-    "varpin.estimation.sensitivities": "Gradient Sensitivities sensitivities",
+    "varpin.estimation": "Estimate Gradient Log Sensitivities kalman_filter sensitivities smooth",
     "varpin.io.scenefile": "SceneFile SceneFileError load_scene",
     "varpin.linearization": "Curvature Linearization Moments linearize propagate_moments second_order",
     "varpin.model.clearance": "Obstacle",

@@ -67,6 +67,7 @@ class Linearization:
             linear between nodes, dx1 = A dx + (B - ramp) du_k + ramp du_(k+1).
         Gramp: Derivative of G in such a change (N, 2n, k, m); None where ``ramp`` is.
         warnings: Where moments of velocities are wrong, as damping is fast for the step; from :func:`linearize`.
+        constrained: Whether the scene has constraints; from :func:`linearize`.
     """
 
     A: Floats
@@ -82,6 +83,7 @@ class Linearization:
     ramp: Floats | None = None
     Gramp: Floats | None = None
     warnings: tuple[str, ...] = ()
+    constrained: bool = False
 
     def __repr__(self) -> str:
         states, controls = self.B.shape[1:]
@@ -102,6 +104,29 @@ class Linearization:
         noise = self.G[j] + np.einsum("aib,...b->...ai", self.Gx[j], x) + np.einsum("aib,...b->...ai", self.Gu[j], u)
         dx1: Floats = x @ self.A[j].T + u @ self.B[j].T + np.einsum("...ai,...i->...a", noise, w)
         return dx1
+
+    def process_covariance(self) -> Floats:
+        """Covariance (N, 2n, 2n) that white forces of the intensities F add to the state in each step.
+
+        It is that of the continuous equation, equation (K1) of docs/mathematics.md, whatever the integrator draws:
+        the force of the noise moves q within the step, so that the covariance has rank 2n, while a single increment a
+        step has rank n and makes a filter overconfident. To leading order it is, for x = (q, p),
+
+            [[dt^3/3 M^-1 FF' M^-1, dt^2/2 M^-1 FF'], [dt^2/2 FF' M^-1, dt FF']]
+
+        and it is right to the square of dt times the rates of the motion and its dampers.
+
+        Raises:
+            InputError: The scene has constraints.
+        """
+        if self.constrained:
+            raise InputError("process_covariance() is of scenes without constraints")
+        n = self.B.shape[1] // 2
+        # F, or M^-1 F: the jump at the end of the step. The one at its start has become A jump by then.
+        late: Floats = self.F
+        if not self.variational:
+            late = np.asarray(np.linalg.solve(self.J[:, n:], self.K[:, n:] @ late), dtype=np.float64)
+        return white_covariance(self.A, late @ np.swapaxes(late, 1, 2), self.dt)
 
 
 def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | None = None) -> Linearization:
@@ -125,7 +150,7 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     found = linearize_steps(scene, trajectory, integrator, trajectory.q[0], ramps=within)
     if not integrator.variational:
         found = replace(found, K=_kick_columns(scene, trajectory, found.J))
-    return replace(found, warnings=wrong_spread(scene, integrator, trajectory))
+    return replace(found, warnings=wrong_spread(scene, integrator, trajectory), constrained=bool(scene.constraints))
 
 
 def linearize_steps(
@@ -188,6 +213,21 @@ def linearize_steps(
         Gramp[..., scene.prescribed] = Gu[..., scene.prescribed]
     F = np.broadcast_to(start.F[:, :, : scene.processes], (steps, n, scene.processes))
     return Linearization(A, B, K, Jk, F, G, Gx, Gu, trajectory.dt, integrator.variational, ramp, Gramp)
+
+
+def white_covariance(A: Floats, spread: Floats, dt: float) -> Floats:
+    """Covariances (N, 2n, 2n) of steps with derivatives A under white jumps of the state's second half.
+
+    ``spread`` (N, n, n) is their covariance in a unit of time. A jump at time s before the end of a step is taken to
+    reach it as the line, in s, from the jump itself to A times it: (K1).
+    """
+    n = spread.shape[1]
+    through = A[:, :, n:] @ spread
+    found: Floats = through @ np.swapaxes(A[:, :, n:], 1, 2)
+    found[:, :, n:] += 0.5 * through
+    found[:, n:] += 0.5 * np.swapaxes(through, 1, 2)
+    found[:, n:, n:] += spread
+    return (dt / 3.0) * found
 
 
 @dataclass(frozen=True, eq=False)
@@ -434,7 +474,7 @@ def propagate_moments(
     if mean is not None:
         means[0] = finite_array("mean", mean, (size,))
     if covariance is not None:
-        covariances[0] = _require_covariance(finite_array("covariance", covariance, (size, size)))
+        covariances[0] = require_covariance(finite_array("covariance", covariance, (size, size)))
     for j in range(linearization.steps):
         A, Gx, m, P = linearization.A[j], linearization.Gx[j], means[j], covariances[j]
         g = linearization.G[j] + np.einsum("aib,b->ai", Gx, m)
@@ -445,7 +485,7 @@ def propagate_moments(
     return Moments(means, covariances, linearization.warnings)
 
 
-def _require_covariance(P: Floats) -> Floats:
+def require_covariance(P: Floats) -> Floats:
     """``P``, refused if it is asymmetric or indefinite beyond rounding in units of its deviations."""
     deviation = np.sqrt(np.maximum(np.diag(P), 0.0))
     scale = np.where(deviation > 0.0, deviation, 1.0)

@@ -13,4 +13,5 @@ NB_MODULE(_core, m) {
     varpin::border::register_constrained(m);
     varpin::border::register_checks(m);
     varpin::border::register_costs(m);
+    varpin::border::register_filter(m);
 }

@@ -32,6 +32,7 @@ void register_rollouts(nanobind::module_& m);
 void register_constrained(nanobind::module_& m);
 void register_checks(nanobind::module_& m);
 void register_costs(nanobind::module_& m);
+void register_filter(nanobind::module_& m);
 
 }  // namespace border
 

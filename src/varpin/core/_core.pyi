@@ -6,7 +6,7 @@ from enum import Enum, IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.core.arrays import Commands, ConstraintRows, RolloutArrays
+from varpin.core.arrays import Commands, ConstraintRows, FilterLog, RolloutArrays
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -403,6 +403,16 @@ class ExplicitRollout:
         ``increments`` of the Wiener processes are (P, N, k), or (0, 0, k) for none; ``drift`` is a force in addition to
         the controls (P, N, n), or (0, 0, n) for none.
         """
+
+def filter_variational(
+    mechanism: Mechanism, tableau: Tableau, tolerance: float, guards: Guards, log: FilterLog
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats, Floats, int, int]:
+    """The Kalman filter over a log, in (q, p): FilterArrays, why it ended and the samples that it reached."""
+
+def filter_explicit(
+    mechanism: Mechanism, method: ExplicitMethod, log: FilterLog
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats, Floats, int, int]:
+    """The same in (q, v)."""
 
 def linearize_explicit(
     mechanism: Mechanism, method: ExplicitMethod, dt: float, q: Floats, v: Floats, force: Floats, ramp: bool = False

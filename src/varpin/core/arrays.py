@@ -136,6 +136,36 @@ class Commands(NamedTuple):
     own: int = 0
 
 
+class FilterLog(NamedTuple):
+    """K samples of z numbers, positions and then velocities if there are any, and what acts in the K - 1 intervals.
+
+    The state is (q, p) or (q, v), with d = 2n, or with the external forces on the joints, too, d = 3n.
+    """
+
+    mean: Floats  # (d,) before the first sample
+    covariance: Floats  # (d, d)
+    measured: Floats  # (K, z), NaN where missing
+    variance: Floats  # (z,) of their errors
+    parts: Integers  # (K - 1,) steps in each interval
+    h: Floats  # (K - 1,) their length [s]
+    force: Floats  # (K - 1, n) of the controls
+    spread: Floats  # (K - 1, n, n) F F' of the noise
+    kept: Floats  # (K - 1,) share of external forces that a step keeps
+    added: Floats  # (K - 1, n) variance that it adds to them
+
+
+class FilterArrays(NamedTuple):
+    """Moments of the state before and after each sample, and what gave them."""
+
+    predicted: Floats  # (K, d)
+    predicted_covariance: Floats  # (K, d, d)
+    state: Floats  # (K, d)
+    covariance: Floats  # (K, d, d)
+    transition: Floats  # (K - 1, d, d) derivatives of a prediction in the state before
+    innovations: Floats  # (K, z) measured minus predicted, NaN where missing
+    slopes: Floats  # (K, n, 2n) derivatives of predicted velocities in the state; (0, n, 2n) where none are measured
+
+
 class RolloutArrays(NamedTuple):
     """Output of a rollout of P paths over N steps: the node after each step, and the work of the step."""
 

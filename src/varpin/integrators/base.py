@@ -13,8 +13,8 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 
 from varpin.arrays import Floats, Integers
-from varpin.core.arrays import Commands, RolloutArrays, new_nodes
-from varpin.errors import InputError, SingularMassMatrix
+from varpin.core.arrays import Commands, FilterArrays, FilterLog, RolloutArrays, new_nodes
+from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.noise import Fields, over_steps
 from varpin.mechanics.scene import Scene
@@ -255,6 +255,23 @@ class Integrator(ABC):
         raise InputError(
             f"{self} has no second-order linearization; variational integrators have, such as varpin.Gauss(...)"
         )
+
+    def filtered(self, scene: Scene, log: FilterLog) -> FilterArrays:  # noqa: ARG002
+        """The extended Kalman filter over a log, by the derivatives of this method's steps, without constraints.
+
+        Raises:
+            InputError: The integrator does not provide it.
+            LinearizationError: A step has no solution; its index is that of the sample before.
+        """
+        raise InputError(f"{self} has no Kalman filter; the others have, such as varpin.Gauss(stages=2)")
+
+    def _reached(self, found: tuple[Any, ...], log: FilterLog, reasons: Mapping[int, str]) -> FilterArrays:
+        """The arrays of the core's filter, which ended early if a step has no solution."""
+        *arrays, outcome, done = found
+        if outcome in reasons:
+            time = float(log.parts[: done - 1] @ log.h[: done - 1])
+            raise LinearizationError(done - 1, time, reasons[outcome])
+        return FilterArrays(*arrays)
 
 
 @dataclass(frozen=True)

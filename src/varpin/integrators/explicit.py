@@ -12,7 +12,7 @@ import scipy
 from varpin import core
 from varpin.arrays import Floats
 from varpin.core import ExplicitMethod, Mechanism, Outcome
-from varpin.core.arrays import Commands, new_nodes
+from varpin.core.arrays import Commands, FilterArrays, FilterLog, new_nodes
 from varpin.errors import LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
     Compiled,
@@ -114,6 +114,10 @@ class _Explicit(Compiled):
             da.append(moved)
         ends = h * h * _weighed(self.end_q, da, none), h * _weighed(self.end_v, da, none)
         return np.concatenate(ends, axis=1)
+
+    def filtered(self, scene: Scene, log: FilterLog) -> FilterArrays:
+        """See :meth:`Integrator.filtered`; the state is (q, v)."""
+        return self._reached(core.filter_explicit(scene.core, self.method, log), log, REASONS)
 
     def _jump(self, in_v: Floats) -> Floats:
         """Derivatives of each step in a jump (N, 2n, n), from those in the velocity."""

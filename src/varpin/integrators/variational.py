@@ -18,8 +18,9 @@ from varpin.core import (
     Steps,
     Tableau,
     constrained_derivatives,
+    filter_variational,
 )
-from varpin.core.arrays import Commands, RolloutArrays, new_nodes
+from varpin.core.arrays import Commands, FilterArrays, FilterLog, RolloutArrays, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
     Compiled,
@@ -329,6 +330,12 @@ class Variational(Compiled):
         q, v, outcome, done = Steps(**self._steps(scene, trajectory)).ends()
         _require_solved(trajectory, outcome, done)
         return q, v
+
+    def filtered(self, scene: Scene, log: FilterLog) -> FilterArrays:
+        """See :meth:`Integrator.filtered`; the state is (q, p)."""
+        guards = _core_guards(replace(self.guard or Guard(), energy_balance=_UNCHECKED, energy_budget=_UNCHECKED))
+        found = filter_variational(scene.core, self._tableau(), float(self.tolerance), guards, log)
+        return self._reached(found, log, REASONS)
 
     def _steps(self, scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
         """Arguments of the core, by name, to repeat every step at dw = 0."""

@@ -51,8 +51,12 @@ class VariationalLinearization {
     }
     std::size_t parameters() const { return columns->parameters.size(); }
 
-    // Take derivatives in an external force in the place of f, which drives limit.
-    void take_external() { stepper.equation.by_external = true; }
+    // Take derivatives in an external force (n), which acts beside f unless null, in the place of f, which drives
+    // limit.
+    void take_external(const double* force = nullptr) {
+        stepper.equation.by_external = true;
+        stepper.outer = force;
+    }
 
     // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a force f, and unless null
     // Jr (2n, n) in a force that grows linearly from 0 at the start of the step to f at its end, and Jp (2n, k) in the
@@ -71,20 +75,16 @@ class VariationalLinearization {
             }
             return outcome;
         }
-        chained.begin(Jx, Jf);
-        if (Jr) std::fill(Jr, Jr + entries(2 * n, n), 0.0);
-        if (Jp) std::fill(Jp, Jp + in_parameters.size(), 0.0);
-        return parts(h, q, p, force, halvings, [&](double begin, double length) {
-            part_derivatives(length);
-            chained.follow(Jx, Jf);
-            if (Jp) {
-                parameter_derivatives(length, in_parameters.data());
-                chained.follow_more(Jp, in_parameters);
-            }
-            if (!Jr) return;
-            ramp_derivatives(length, begin, length / h, chained.part_rate.data());
-            chained.follow_rates(Jr);
-        });
+        return in_parts(h, q, p, force, halvings, Jx, Jf, Jr, Jp);
+    }
+
+    // The same in the parts that the guards require, with its end.
+    Outcome step(double h, const double* q, const double* p, const double* force, double* Jx, double* Jf, double* q1,
+                 double* p1) {
+        const Outcome outcome = in_parts(h, q, p, force, {}, Jx, Jf, nullptr);
+        std::copy(state.q.begin(), state.q.end(), q1);
+        std::copy(state.momentum.begin(), state.momentum.end(), p1);
+        return outcome;
     }
 
     // q1 and M(q1)^-1 p1 (n) of the step of which `first` gives the derivatives.
@@ -95,6 +95,14 @@ class VariationalLinearization {
         std::copy(state.q.begin(), state.q.end(), q1);
         std::copy(state.v.begin(), state.v.end(), v1);
         return Outcome::solved;
+    }
+
+    // v = M(q)^-1 p and its derivatives (n, 2n) in (q, p); false where M(q) is not positive definite.
+    bool velocity(const double* q, const double* p, double* v, double* slopes) {
+        if (!stepper.begin_at(q, p, state)) return false;
+        std::copy(state.v.begin(), state.v.end(), v);
+        stepper.equation.kernels.velocity_slopes(stepper.mechanism, 1, q, v, slopes);
+        return true;
     }
 
     // z . d2(q1, p1)/d(q0, p0, f)2 of one step, into H (3n, 3n). For a divided step, z is propagated backward by the
@@ -158,6 +166,24 @@ class VariationalLinearization {
     std::vector<Dual> at_f;
     std::vector<Dual> coupled_q, coupled_v;                   // (n, n) of couplings, along a direction
     std::vector<JointForce<Dual>> along_q, along_v, along_f;  // (n) of the elements, with derivatives in q, in v, in f
+
+    Outcome in_parts(double h, const double* q, const double* p, const double* force,
+                     std::span<const std::uint8_t> halvings, double* Jx, double* Jf, double* Jr, double* Jp = nullptr) {
+        chained.begin(Jx, Jf);
+        if (Jr) std::fill(Jr, Jr + entries(2 * n, n), 0.0);
+        if (Jp) std::fill(Jp, Jp + in_parameters.size(), 0.0);
+        return parts(h, q, p, force, halvings, [&](double begin, double length) {
+            part_derivatives(length);
+            chained.follow(Jx, Jf);
+            if (Jp) {
+                parameter_derivatives(length, in_parameters.data());
+                chained.follow_more(Jp, in_parameters);
+            }
+            if (!Jr) return;
+            ramp_derivatives(length, begin, length / h, chained.part_rate.data());
+            chained.follow_rates(Jr);
+        });
+    }
 
     // The root of an undivided step, from a guess (s, n). If the guess is too far away, for example because friction
     // changes its sign within the step, from the initial velocity, and then by repetition of the steps before.

@@ -1,0 +1,348 @@
+"""Extended Kalman filter and Rauch-Tung-Striebel smoother of a log, on the exact derivatives of steps.
+
+Equations (K1) and (K2) of docs/mathematics.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from varpin.arrays import Floats
+from varpin.core.arrays import FilterArrays, FilterLog
+from varpin.errors import InputError
+from varpin.estimation.log import Log, as_log
+from varpin.finding import Finding
+from varpin.integrators import Integrator
+from varpin.linearization import node_jets, require_covariance, velocity_at_nodes
+from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
+from varpin.simulation.choice import given_integrator, usual_integrator
+from varpin.support.checks import JointValues, finite_array, joint_array, positive
+from varpin.support.frozen import Frozen
+from varpin.trajectory import Trajectory
+
+# Standard deviations of a start that is not given, in units of those of the first two samples: it then counts for 1e-4
+# of a sample. Much wider ones lose digits, 1e-16 times their square.
+_WIDE = 100.0
+# Longest step where none is given, in usual intervals of the log: one step from sample to sample though the clock
+# jitters, and more over gaps.
+_JITTER = 1.5
+# Excess of an interval over a multiple of the step that makes no further step: rounding.
+_ROUNDING = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate(Frozen):
+    """The states of an arm at the samples of a log, from :func:`kalman_filter` or :func:`smooth`.
+
+    Attributes:
+        t: Times of the samples (K,) [s].
+        q: Positions (K, n) [rad or m].
+        v: Velocities (K, n) [rad/s or m/s].
+        covariance: Covariance of the errors of (q, v), (K, 2n, 2n).
+        external: External forces on the joints (K, n) [N m or N]; None where they were not asked for.
+        external_covariance: Covariance of their errors (K, n, n), or None.
+        innovations: Samples minus their predictions from the samples before (K, n) [rad or m], with those of measured
+            velocities (K, 2n) [rad/s or m/s]; NaN where a sample is missing.
+        forward: Moments of the filter's state before and after each sample, and derivatives of predictions: (q, p) for
+            variational integrators and (q, v) for the others, then the external forces.
+        given: What the filter was given, in the form of the core.
+        joint_names: The joints of the columns.
+        integrator: Whose steps these are, as text.
+        variational: Whether the filter's state is (q, p) rather than (q, v).
+        smoothed: Whether all samples tell of a state, and not those up to it alone.
+        warnings: What is doubtful about the log.
+    """
+
+    t: Floats
+    q: Floats
+    v: Floats
+    covariance: Floats
+    external: Floats | None
+    external_covariance: Floats | None
+    forward: FilterArrays = field(repr=False)
+    given: FilterLog = field(repr=False)
+    joint_names: tuple[str, ...]
+    integrator: str
+    variational: bool
+    smoothed: bool = False
+    warnings: tuple[Finding, ...] = ()
+
+    def __repr__(self) -> str:
+        what, n = "smoothed" if self.smoothed else "filtered", self.q.shape[1]
+        return f"Estimate({len(self.t)} samples, {n} joints, {what} by {self.integrator})"
+
+    @property
+    def innovations(self) -> Floats:
+        """See the class."""
+        return self.forward.innovations
+
+    @cached_property
+    def rows(self) -> Floats:
+        """Derivatives of the predicted samples in the filter's state (K, z, d)."""
+        (K, z), d, n = self.innovations.shape, self.given.mean.size, self.q.shape[1]
+        H = np.zeros((K, z, d))
+        H[:, :n, :n] = np.eye(n)
+        if z > n:
+            H[:, n:, : 2 * n] = self.forward.slopes
+        return H
+
+    @cached_property
+    def S(self) -> Floats:
+        """Covariances of the innovations (K, z, z)."""
+        H = self.rows
+        found: Floats = H @ self.forward.predicted_covariance @ np.swapaxes(H, 1, 2) + np.diag(self.given.variance)
+        return found
+
+    @cached_property
+    def gains(self) -> Floats:
+        """Gains of the filter (K, d, z): what a unit of an innovation moves the state; 0 for missing samples."""
+        S, _, present = self._present
+        HP = self.rows @ self.forward.predicted_covariance * present[:, :, None]
+        return np.swapaxes(np.linalg.solve(S, HP), 1, 2)
+
+    @cached_property
+    def _present(self) -> tuple[Floats, Floats, np.ndarray[tuple[int, ...], np.dtype[np.bool_]]]:
+        """S with rows of the unit matrix and innovations with 0 for missing samples, and which are there."""
+        present = np.isfinite(self.innovations)
+        both = present[:, :, None] & present[:, None]
+        S = np.where(both, self.S, np.eye(present.shape[1]))
+        return S, np.where(present, self.innovations, 0.0), present
+
+    @cached_property
+    def log_likelihood(self) -> float:
+        """Logarithm of the density of all samples, given the start and the scene."""
+        S, _, present = self._present
+        bits = np.linalg.slogdet(S)[1].sum() + present.sum() * np.log(2.0 * np.pi)
+        return float(-0.5 * (self.nis().sum() + bits))
+
+    def nis(self) -> Floats:
+        """Normalized squares of the innovations (K,): of as many degrees of freedom as a sample has numbers.
+
+        Means far above that number tell of noise that is larger than given, or of a scene that is wrong.
+        """
+        S, e, _ = self._present
+        return _squares(S, e)
+
+    def nees(self, q: ArrayLike, v: ArrayLike) -> Floats:
+        """Normalized squares of the errors of (q, v) against a known motion (K,): of 2n degrees of freedom.
+
+        Args:
+            q: Its positions at the samples (K, n) [rad or m].
+            v: Its velocities (K, n) [rad/s or m/s].
+
+        Raises:
+            InputError: A shape is wrong, or a value is not finite.
+        """
+        off = [finite_array(name, x, own.shape) - own for name, x, own in (("q", q, self.q), ("v", v, self.v))]
+        return _squares(self.covariance, np.concatenate(off, axis=1))
+
+
+def kalman_filter(
+    scene: Scene,
+    log: Log | Trajectory,
+    *,
+    q_noise: JointValues,
+    v_noise: JointValues | None = None,
+    external: tuple[JointValues, float] | None = None,
+    dt: float | None = None,
+    q0: JointValues | None = None,
+    v0: JointValues | None = None,
+    covariance: ArrayLike | None = None,
+    integrator: Integrator | None = None,
+) -> Estimate:
+    """Estimate positions, velocities and external forces at each sample of a log from the samples up to it.
+
+    It is an extended Kalman filter on the exact derivatives of the integrator's steps, (K2) of docs/mathematics.md.
+
+    Main args:
+        scene: The scene. Its noise is what moves the arm besides, as forces: white, of any model but those that depend
+            on the velocity. Scenes with constraints are refused.
+        log: The log, or a simulated motion. Missing samples are left out, joint by joint.
+        q_noise: Standard deviation of an encoder's error: one number, (n,) or by joint name [rad or m].
+        v_noise: The same of measured velocities [rad/s or m/s]; without it they are not used.
+        external: Estimate external forces on all joints, too, such as those of a collision: their standard deviation,
+            one number, (n,) or by joint name [N m or N], and the time [s] after which they are forgotten. It is a
+            momentum observer for encoders alone.
+
+    Other Args:
+        dt: Longest step [s]: each interval of the log is covered by equal steps. If left out, one step from sample to
+            sample, and more over gaps.
+        q0: Mean of the position at the first sample [rad or m]; if left out, that sample.
+        v0: Mean of the velocity there [rad/s or m/s]; if left out, the difference of the first two samples.
+        covariance: Covariance of (q0, v0) (2n, 2n); if left out, a hundred times the standard deviations of the first
+            two samples, which is as good as unknown.
+        integrator: If left out, as for a motion without noise: the usual choice of :func:`varpin.simulate`.
+
+    Raises:
+        InputError: The scene has no noise, noise that depends on the velocity, or constraints; the log does not fit it;
+            or a value is out of its range.
+        UnknownJoint: A name is no joint of the robot.
+        LinearizationError: A step from an estimate has no solution.
+    """
+    log = as_log(log).matched(require_scene(scene))
+    refuse_constraints(scene, "a Kalman filter")
+    if scene.noise.velocity_dependent:
+        raise InputError("a Kalman filter does not take noise whose fields depend on the velocity")
+    if not scene.processes and external is None:
+        raise InputError(
+            "the scene has no noise, so that a filter would trust it more than any sample: varpin.Scene(robot, "
+            "noise=varpin.AdditiveNoise(intensity)) says how strong the forces are that it does not know"
+        )
+    joints, n = scene.robot.joint_names, scene.robot.dof
+    measured, variance = _measured(log, q_noise, v_noise)
+    q, *start = _first_samples(log, variance[:n])
+    for at, (name, given) in enumerate({"q0": q0, "v0": v0}.items()):
+        start[at] = start[at] if given is None else joint_array(name, given, joints)
+    if covariance is not None:
+        start[2] = require_covariance(finite_array("covariance", covariance, (2 * n, 2 * n)))
+    parts, h = _steps(log.t, dt)
+    integrator = given_integrator(integrator)
+    if integrator is None:
+        integrator = usual_integrator(scene, start[0], start[1], float(h.max()), noisy=False)
+    mean, P = _of_state(scene, *start, variational=integrator.variational)
+    strength, kept = np.zeros(n), np.zeros(len(h))
+    if external is not None:
+        strength, kept = _external(external, joints, h)
+        mean, P = np.concatenate([mean, np.zeros(n)]), _beside(P, np.diag(strength))
+    F = scene.noise.fields(q[:-1], np.zeros_like(q[:-1]), log.u[:-1], q[0]).F
+    force, spread = log.u[:-1] @ scene.actuation.T, F @ np.swapaxes(F, 1, 2)
+    added = (1.0 - kept[:, None] ** 2) * strength
+    seen = FilterLog(mean, P, measured, variance, parts, h, *map(np.ascontiguousarray, (force, spread, kept, added)))
+    found = integrator.filtered(scene, seen)
+    states = _in_velocities(scene, found.state, found.covariance, variational=integrator.variational)
+    text, variational = str(integrator), integrator.variational
+    return Estimate(log.t, *states, found, seen, joints, text, variational, warnings=log.warnings)
+
+
+def smooth(
+    scene: Scene,
+    log: Log | Trajectory,
+    *,
+    q_noise: JointValues,
+    v_noise: JointValues | None = None,
+    external: tuple[JointValues, float] | None = None,
+    dt: float | None = None,
+    q0: JointValues | None = None,
+    v0: JointValues | None = None,
+    covariance: ArrayLike | None = None,
+    integrator: Integrator | None = None,
+) -> Estimate:
+    """Estimate positions, velocities and external forces at the samples of a log from all of them.
+
+    It is the smoother of Rauch, Tung and Striebel after :func:`kalman_filter`, whose arguments and errors it has.
+    """
+    options: dict[str, Any] = {"q0": q0, "v0": v0, "covariance": covariance, "integrator": integrator}
+    filtered = kalman_filter(scene, log, q_noise=q_noise, v_noise=v_noise, external=external, dt=dt, **options)
+    states = _in_velocities(scene, *_backward(filtered.forward), variational=filtered.variational)
+    names = ("q", "v", "covariance", "external", "external_covariance")
+    return filtered.changed(**dict(zip(names, states, strict=True)), smoothed=True)
+
+
+def _measured(log: Log, q_noise: JointValues, v_noise: JointValues | None) -> tuple[Floats, Floats]:
+    """The samples (K, z) of a log in the robot's order, and the variances (z,) of their errors."""
+    joints = log.joints or ()
+    variance = _variance("q_noise", q_noise, joints)
+    if v_noise is None:
+        return np.ascontiguousarray(log.q), variance
+    if log.v is None:
+        raise InputError("v_noise is given, and the log has no velocities v")
+    both = np.ascontiguousarray(np.concatenate([log.q, log.v], axis=1))
+    return both, np.concatenate([variance, _variance("v_noise", v_noise, joints)])
+
+
+def _variance(name: str, value: JointValues, joints: tuple[str, ...]) -> Floats:
+    deviation = joint_array(name, value, joints, uniform=True)
+    if not (deviation > 0.0).all():
+        raise InputError(f"{name} must be positive for every joint, got {deviation.min():g}")
+    return deviation**2
+
+
+def _external(given: tuple[JointValues, float], joints: tuple[str, ...], h: Floats) -> tuple[Floats, Floats]:
+    """Variances (n,) of external forces, and the share (K - 1,) that steps of length h keep of them."""
+    if not isinstance(given, tuple) or len(given) != 2:
+        raise InputError(f"external must be (standard deviation [N m or N], time [s]), got {given!r}")
+    strength = _variance("external: standard deviation", given[0], joints)
+    return strength, np.exp(-h / positive("external: time", given[1], "s"))
+
+
+def _steps(t: Floats, dt: float | None) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.int64]], Floats]:
+    """The number of steps (K - 1,) in each interval, and their length [s]."""
+    intervals = np.diff(t)
+    longest = _JITTER * float(np.median(intervals)) if dt is None else positive("dt", dt, "s")
+    parts = np.maximum(1, np.ceil(intervals / longest - _ROUNDING)).astype(np.int64)
+    return parts, intervals / parts
+
+
+def _first_samples(log: Log, variance: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Positions without gaps (K, n), and position, velocity and a wide covariance of (q, v) at the first sample."""
+    q, n = np.empty_like(log.q), log.q.shape[1]
+    first, rate, deviation = np.empty(n), np.empty(n), np.sqrt(np.tile(variance, 2))
+    for c, column in enumerate(log.q.T):
+        there = np.flatnonzero(np.isfinite(column))
+        begin, end = there[:2]
+        span, late = log.t[end] - log.t[begin], log.t[begin] - log.t[0]
+        q[:, c] = np.interp(log.t, log.t[there], column[there])
+        rate[c] = (column[end] - column[begin]) / span
+        first[c] = column[begin] - late * rate[c]
+        deviation[[c, n + c]] *= np.sqrt(2.0) * np.array([1.0 + late / span, 1.0 / span])
+    return q, first, rate, np.diag((_WIDE * deviation) ** 2)
+
+
+def _of_state(scene: Scene, q: Floats, v: Floats, P: Floats, *, variational: bool) -> tuple[Floats, Floats]:
+    """Mean and covariance of the filter's state from those of (q, v): dp = L_vq dq + M dv."""
+    if not variational:
+        return np.concatenate([q, v]), P
+    M, A = (jet[0] for jet in node_jets(scene, q[None], v[None]))
+    to = np.block([[np.eye(q.size), np.zeros_like(M)], [A, M]])
+    return np.concatenate([q, M @ v]), to @ P @ to.T
+
+
+def _in_velocities(
+    scene: Scene, x: Floats, P: Floats, *, variational: bool
+) -> tuple[Floats, Floats, Floats, Floats | None, Floats | None]:
+    """q, v, their covariance, and external forces with theirs, from moments (K, d), (K, d, d) of the filter's state."""
+    n = scene.robot.dof
+    q, v, covariance = x[:, :n].copy(), x[:, n : 2 * n].copy(), P[:, : 2 * n, : 2 * n].copy()
+    if variational:
+        M, _ = node_jets(scene, q, v)
+        v = np.ascontiguousarray(np.linalg.solve(M, v[:, :, None])[:, :, 0])
+        lower = velocity_at_nodes(scene, q, v)
+        cross = lower @ covariance
+        covariance[:, n:, :n] = cross[:, :, :n]
+        covariance[:, :n, n:] = np.swapaxes(cross[:, :, :n], 1, 2)
+        covariance[:, n:, n:] = cross @ np.swapaxes(lower, 1, 2)
+    more = x.shape[1] > 2 * n
+    return q, v, covariance, *((x[:, 2 * n :], P[:, 2 * n :, 2 * n :]) if more else (None, None))
+
+
+def _backward(found: FilterArrays) -> tuple[Floats, Floats]:
+    """Smoothed moments (K, d), (K, d, d) of the filter's state."""
+    x, P = found.state.copy(), found.covariance.copy()
+    before, ahead = found.predicted_covariance[1:], found.transition @ P[:-1]
+    # In units of the deviations: momenta of light joints are 1e-6 and less.
+    scale = np.sqrt(np.diagonal(before, axis1=1, axis2=2))[:, :, None]
+    back = np.swapaxes(np.linalg.solve(before / (scale * np.swapaxes(scale, 1, 2)), ahead / scale) / scale, 1, 2)
+    for k in range(len(x) - 2, -1, -1):
+        x[k] += back[k] @ (x[k + 1] - found.predicted[k + 1])
+        P[k] += back[k] @ (P[k + 1] - before[k]) @ back[k].T
+    return x, 0.5 * (P + np.swapaxes(P, 1, 2))
+
+
+def _beside(a: Floats, b: Floats) -> Floats:
+    """Both matrices on the diagonal of one."""
+    found = np.zeros((len(a) + len(b), len(a) + len(b)))
+    found[: len(a), : len(a)], found[len(a) :, len(a) :] = a, b
+    return found
+
+
+def _squares(S: Floats, e: Floats) -> Floats:
+    """The e' S^-1 e of each row, in units of the deviations."""
+    scale = np.sqrt(np.diagonal(S, axis1=1, axis2=2))
+    scaled, y = S / (scale[:, :, None] * scale[:, None]), e / scale
+    found: Floats = np.einsum("Ki,Ki->K", y, np.linalg.solve(scaled, y[:, :, None])[:, :, 0])
+    return found

@@ -1,0 +1,277 @@
+"""The log of an arm: what its encoders read under known controls."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from varpin.arrays import Floats
+from varpin.errors import FileError, InputError, UnknownJoint
+from varpin.finding import Finding, announce
+from varpin.io.archive import atomic_file, members_of, read_npz, write_npz
+from varpin.mechanics.scene import Scene
+from varpin.model import degrees_hint, joint_unit
+from varpin.support.checks import as_floats, is_file, path_like, require_finite, tuple_of
+from varpin.support.frozen import Frozen
+from varpin.trajectory import Trajectory
+
+FORMAT = "varpin.log/1"
+
+# A gap in the clock of so many median steps is told: some lost packets of a bus are fewer.
+_GAP = 10.0
+# Longest median step [s] that is not told: arms are logged at 10 Hz and more, so longer ones look like milliseconds.
+_SLOW = 0.5
+# Distance beyond a joint's limits that is told [rad or m]: stops yield, and zeros of encoders are off, by less.
+_BEYOND = 0.1
+# Fewest samples of a joint: fewer tell no velocity.
+_LEAST = 2
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Log(Frozen):
+    """Measured positions of an arm, and the controls that acted.
+
+    Attributes:
+        t: Times of the samples (K,) [s], strictly increasing, as uneven as they are.
+        q: Measured positions (K, n) [rad or m]; NaN where a sample is missing.
+        u: Controls (K, m), without gaps; u[k] acts from t[k] to t[k + 1].
+        v: Measured velocities (K, n) [rad/s or m/s], NaN where one is missing; None for encoders alone.
+        joints: The joints of the columns of q and v; None for the robot's order.
+        controls: The joints of the columns of u. If left out, ``joints`` where u is as wide as q, and else the scene's
+            order.
+        warnings: What is doubtful about the log, from :meth:`matched`.
+
+    Raises:
+        InputError: Shapes do not fit together, t does not increase, or a value is infinite, or NaN in t or u.
+    """
+
+    t: Floats
+    q: Floats
+    u: Floats
+    v: Floats | None = None
+    joints: tuple[str, ...] | None = None
+    controls: tuple[str, ...] | None = None
+    warnings: tuple[Finding, ...] = field(default=(), metadata={"entry": None})
+
+    def __post_init__(self) -> None:
+        t = require_finite("Log t", as_floats("Log t", self.t))
+        if t.ndim != 1 or len(t) < _LEAST:
+            raise InputError(f"Log t must have shape (K,) with at least {_LEAST} samples, got {t.shape}")
+        back = np.flatnonzero(np.diff(t) <= 0.0)
+        if back.size:
+            k = int(back[0]) + 1
+            raise InputError(
+                f"Log t must increase, and t[{k}] = {t[k]:.9g} s follows {t[k - 1]:.9g} s: sort the rows by time and "
+                "drop repeated ones"
+            )
+        q, u = _rows("Log q", self.q, len(t)), require_finite("Log u", _rows("Log u", self.u, len(t)))
+        v = None if self.v is None else _rows("Log v", self.v, len(t))
+        if v is not None and v.shape != q.shape:
+            raise InputError(f"Log v must have the shape of q, {q.shape}, got {v.shape}")
+        joints = _names("joints", self.joints, q.shape[1])
+        controls = joints if self.controls is None and q.shape == u.shape else self.controls
+        for array in (t, q, u) if v is None else (t, q, u, v):
+            array.setflags(write=False)
+        # The frozen dataclass refuses assignments.
+        vars(self).update(t=t, q=q, u=u, v=v, joints=joints, controls=_names("controls", controls, u.shape[1]))
+
+    def __repr__(self) -> str:
+        missing = 100.0 * float(np.isnan(self.q).mean())
+        return (
+            f"Log({len(self.t)} samples in {self.t[-1] - self.t[0]:g} s, {self.q.shape[1]} joints, "
+            f"{self.u.shape[1]} controls, {missing:.3g} % missing)"
+        )
+
+    @staticmethod
+    def load(path: str | os.PathLike[str], joints: Sequence[str] | None = None) -> Log:
+        """A log from a file.
+
+        An ``.npz`` file has arrays t, q, u and, if there are any, v, joints and controls. Any other file is read as
+        CSV: its first line names the columns t, q_<joint>, u_<joint> and, if there are any, v_<joint>, in any order;
+        a cell of a missing sample is empty or nan, and other columns are ignored.
+
+        Args:
+            path: The file.
+            joints: Names of the columns of q and v, in place of those in the file.
+
+        Raises:
+            FileError: The file cannot be read, or a cell is no number.
+            InputError: The file's log is none, see :class:`Log`.
+        """
+        source = path_like("path", path)
+        read = _from_npz if source.suffix == ".npz" else _from_csv
+        given = read(source)
+        return Log(**given if joints is None else given | {"joints": tuple_of("joints", joints, str)})
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write ``.npz``, or else CSV, which needs the names ``joints`` and ``controls``; returns the path.
+
+        Raises:
+            FileError: The file cannot be written.
+            InputError: The columns of a CSV file have no names.
+        """
+        target = path_like("path", path)
+        if target.suffix == ".npz":
+            return write_npz(target, FORMAT, members_of(self))
+        if self.joints is None or self.controls is None:
+            raise InputError("a CSV file names its columns: give the log's joints and controls, or save it as .npz")
+        columns = [("q", self.joints, self.q), ("u", self.controls, self.u)]
+        columns += [] if self.v is None else [("v", self.joints, self.v)]
+        head = ["t", *(f"{kind}_{name}" for kind, names, _ in columns for name in names)]
+        rows = np.column_stack([self.t, *(values for _, _, values in columns)])
+        with atomic_file(target) as stream:
+            np.savetxt(stream, rows, "%.17g", ",", header=",".join(head), comments="", encoding="utf-8")
+        return target
+
+    def matched(self, scene: Scene) -> Log:
+        """The log with its columns in the order of a scene's robot and controls, and with ``warnings``, announced.
+
+        Raises:
+            UnknownJoint: A name is no joint of the robot, or of no control.
+            InputError: Columns are missing or too many, or a joint has fewer than two samples.
+        """
+        names = scene.robot.joint_names
+        to_q = _order("q", self.joints, names, self.q.shape[1])
+        to_u = _order("u", self.controls if scene.control_joints else None, scene.control_joints, self.u.shape[1])
+        if self.u.shape[1] != scene.controls:
+            raise InputError(f"the log has {self.u.shape[1]} columns of u, the scene {scene.controls} controls")
+        q, u, v = self.q[:, to_q], self.u[:, to_u], None if self.v is None else self.v[:, to_q]
+        few = np.flatnonzero(np.isfinite(q).sum(axis=0) < _LEAST)
+        if few.size:
+            raise InputError(f"the log has fewer than {_LEAST} samples of joint {names[few[0]]!r}")
+        log = Log(self.t, q, u, v, names, scene.control_joints).changed(warnings=tuple(_doubts(scene, self.t, q, u)))
+        announce(logger, scene.announced, float(np.median(np.diff(self.t))), log.warnings)
+        return log
+
+
+def as_log(given: Log | Trajectory) -> Log:
+    """A log itself, or that of a simulated motion: its positions and the mean controls of its steps, the last again.
+
+    Raises:
+        InputError: It is neither.
+    """
+    if isinstance(given, Log):
+        return given
+    if not isinstance(given, Trajectory):
+        raise InputError(f"a log must be a varpin.Log or a Trajectory, got {type(given).__name__}")
+    return Log(given.t, given.q, given.u[np.minimum(np.arange(len(given.t)), given.steps - 1)], None, given.joint_names)
+
+
+def _rows(name: str, given: Any, rows: int) -> Floats:
+    """An array (K, any) whose entries are finite or NaN."""
+    array = as_floats(name, given)
+    if array.ndim != 2 or len(array) != rows:
+        raise InputError(f"{name} must have a row for each of the {rows} times, got shape {array.shape}")
+    require_finite(name, np.nan_to_num(array, posinf=np.inf, neginf=-np.inf))
+    return array
+
+
+def _names(what: str, given: Any, columns: int) -> tuple[str, ...] | None:
+    if given is None:
+        return None
+    names = tuple_of(f"Log {what}", given, str)
+    if len(names) != columns or len(set(names)) != columns:
+        raise InputError(f"Log {what} must be {columns} different names, one for each column, got {names}")
+    return names
+
+
+def _order(kind: str, given: Sequence[str] | None, names: Sequence[str] | None, columns: int) -> list[int]:
+    """Where the columns of ``names`` are among the ``given`` ones; as they are if either has no names."""
+    if given is None or names is None:
+        if names is not None and columns != len(names):
+            raise InputError(f"the log has {columns} columns of {kind}, the scene has {', '.join(names)}")
+        return list(range(columns))
+    for name in given:
+        if name not in names:
+            raise UnknownJoint(name, names, f"the log's {kind} names a joint that the scene does not have,")
+    if lost := [name for name in names if name not in given]:
+        raise InputError(f"the log has no column of {kind} of joint {lost[0]!r}")
+    return [given.index(name) for name in names]
+
+
+def _doubts(scene: Scene, t: Floats, q: Floats, u: Floats) -> Iterator[Finding]:
+    """What is doubtful about a log in the scene's order, the worst first."""
+    robot, steps = scene.robot, np.diff(t)
+    usual, longest = float(np.median(steps)), int(np.argmax(steps))
+    if usual > _SLOW:
+        text = f"the log has a sample every {usual:.4g} s: t looks like milliseconds, and times are in seconds"
+        yield Finding("clock of the log", text, value=usual, unit="s")
+    with np.errstate(all="ignore"):
+        least, most = np.nanmin(q, axis=0), np.nanmax(q, axis=0)
+    if sentence := degrees_hint(robot, "q", np.where(-least > most, least, most)):
+        yield Finding("log in degrees", sentence)
+    else:
+        yield from _outside(scene, least, most)
+    yield from _dead(scene, most == least, u)
+    if steps[longest] > _GAP * usual:
+        gap, at = float(steps[longest]), float(t[longest])
+        text = f"the log has no samples for {gap:.4g} s after t = {at:.6g} s, {gap / usual:.3g} times its usual step"
+        yield Finding("gap in the log", text, time=at, value=gap, unit="s")
+
+
+def _outside(scene: Scene, least: Floats, most: Floats) -> Iterator[Finding]:
+    lower, upper = scene.robot.position_limits
+    beyond = np.maximum(lower - least, most - upper)
+    joint = int(np.argmax(beyond))
+    if beyond[joint] > _BEYOND:
+        name, unit, far = scene.robot.joint_names[joint], joint_unit(scene.robot, joint), float(beyond[joint])
+        text = f"q of {name!r} is up to {far:.3g} {unit} beyond its limits: its columns may be in another order"
+        yield Finding("log beyond limits", text, name, value=far, unit=unit)
+
+
+def _dead(scene: Scene, still: Floats, u: Floats) -> Iterator[Finding]:
+    """Encoders that read one number to the last bit while a control that changes acts on their joints."""
+    driven = (scene.actuation != 0.0) @ (np.ptp(u, axis=0) > 0.0)
+    for joint in np.flatnonzero(still & driven & (not still.all())):
+        name = scene.robot.joint_names[joint]
+        text = (
+            f"q of {name!r} is one number throughout, though its control changes: its encoder may be dead, and missing "
+            "samples are NaN"
+        )
+        yield Finding("dead encoder", text, name)
+
+
+def _from_npz(source: Path) -> dict[str, Any]:
+    members = read_npz(source)
+    if lost := [name for name in ("t", "q", "u") if name not in members]:
+        raise FileError(f"{source}: {lost[0]} is missing; a log has arrays t, q and u")
+    given: dict[str, Any] = {name: np.asarray(members[name]) for name in ("t", "q", "u", "v") if name in members}
+    return given | {
+        name: tuple(np.asarray(members[name]).tolist()) for name in ("joints", "controls") if name in members
+    }
+
+
+def _from_csv(source: Path) -> dict[str, Any]:
+    if not is_file(source):
+        raise FileError(f"there is no file {source}")
+    try:
+        with source.open(newline="", encoding="utf-8-sig") as stream:
+            head = [cell.strip() for cell in next(csv.reader(stream), [])]
+            rows = np.loadtxt(stream, delimiter=",", ndmin=2, converters=_cell, encoding="utf-8", comments=None)
+    except (OSError, ValueError) as error:
+        raise FileError(f"cannot read {source}: {error}") from None
+    if rows.size and rows.shape[1] != len(head):
+        raise FileError(f"{source}: the first line has {len(head)} names, the others {rows.shape[1]} cells")
+    columns = dict(zip(head, rows.T, strict=False))
+    kinds = {kind: [name[2:] for name in head if name.startswith(f"{kind}_")] for kind in "quv"}
+    if "t" not in columns or not kinds["q"] or not kinds["u"] or sorted(kinds["v"]) not in ([], sorted(kinds["q"])):
+        wanted = "t, q_<joint>..., u_<joint>... and, if there are any, v_<joint>... of the same joints as q"
+        raise FileError(f"{source}: the first line must name the columns {wanted}, got {', '.join(head)[:200]}")
+    kinds["v"] = kinds["q"] if kinds["v"] else []
+    given = {
+        kind: np.column_stack([columns[f"{kind}_{name}"] for name in names]) for kind, names in kinds.items() if names
+    }
+    return given | {"t": columns["t"], "joints": tuple(kinds["q"]), "controls": tuple(kinds["u"])}
+
+
+def _cell(text: str) -> float:
+    return float(text) if text.strip() else np.nan
