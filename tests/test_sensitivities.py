@@ -56,7 +56,8 @@ def compare(scene, names, motion):
 
 FORCES = [vp.JointSpring(3.0, 0.1), vp.Armature(0.01), vp.CoulombFriction(0.5, width=0.5, breakaway=0.7,
                                                                           stribeck_velocity=0.6)]  # fmt: skip
-NAMES = ["damping", "friction:elbow_joint", "stiffness", "rest:elbow_joint", "armature", "payload", "inertia:forearm_link"]  # fmt: skip
+NAMES = ["damping", "friction:elbow_joint", "stiffness", "rest:elbow_joint", "armature", "payload"]
+NAMES += ["inertia:forearm_link"]
 
 
 @pytest.mark.parametrize(

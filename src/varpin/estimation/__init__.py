@@ -5,6 +5,6 @@ from varpin.estimation.filter import kalman_filter as kalman_filter
 from varpin.estimation.filter import smooth as smooth
 from varpin.estimation.log import Log as Log
 from varpin.estimation.log import as_log as as_log
-from varpin.estimation.sensitivities import Gradient as Gradient
-from varpin.estimation.sensitivities import Sensitivities as Sensitivities
-from varpin.estimation.sensitivities import sensitivities as sensitivities
+from varpin.estimation.sensitivity import Gradient as Gradient
+from varpin.estimation.sensitivity import Sensitivities as Sensitivities
+from varpin.estimation.sensitivity import sensitivities as sensitivities
