@@ -293,9 +293,9 @@ def test_a_log_in_files(tmp_path):
             np.testing.assert_array_equal(getattr(again, own), getattr(log, own))
         assert again.joints == again.controls == log.joints
     path = tmp_path / "own.csv"
-    path.write_text("u_a, q_a ,t,hot\n1,0.5,0.0,x\n".replace("x", "1") + "1,,0.1,2\n", encoding="utf-8")
+    path.write_text("u_a, q_a ,t,hot\n1,0.5,0.0,1\n1,,0.1,2\n", encoding="utf-8")
     own = vp.Log.load(path, joints=["b"])
-    assert own.joints == ("b",) and own.controls == ("a",) and np.isnan(own.q[1, 0])
+    assert (own.joints, own.controls, np.isnan(own.q[:, 0]).tolist()) == (("b",), ("a",), [False, True])
     np.savez(tmp_path / "plain.npz", **{name: value.astype(np.float32) for name, value in good().items()})
     assert vp.Log.load(tmp_path / "plain.npz").joints is None
     np.savez(tmp_path / "short.npz", t=[0.0, 1.0])
@@ -303,8 +303,8 @@ def test_a_log_in_files(tmp_path):
         path.write_text(text, encoding="utf-8")
         with pytest.raises(vp.FileError, match=why):
             vp.Log.load(path)
-    for lost in ("short.npz", "none.csv"):
-        with pytest.raises(vp.FileError, match="missing|no file"):
+    for lost, why in (("short.npz", "missing"), ("none.csv", "no file")):
+        with pytest.raises(vp.FileError, match=why):
             vp.Log.load(tmp_path / lost)
     with refused(vp.InputError, "names its columns"):
         vp.Log(**good()).save(path)
@@ -324,7 +324,7 @@ def test_a_motion_is_a_log_of_itself():
     scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(0.1))
     motion = vp.simulate(scene, [0.1, 0.2], [0.0, 0.0], dt=H, steps=20, rng=0, controls=np.ones((20, 2)))
     log = as_log(motion)
-    assert log.u.shape == (21, 2) and log.joints == ("joint1", "joint2")
+    assert (log.u.shape, log.joints) == ((21, 2), ("joint1", "joint2"))
     found = vp.smooth(scene, motion, q_noise=1e-5)
     assert np.abs(found.q - motion.q).max() < 1e-4
     assert repr(found).startswith("Estimate(21 samples, 2 joints, smoothed by Gauss")
@@ -371,7 +371,7 @@ def test_a_doubtful_log_is_told(load, kind, caplog):
     why, change = DOUBTS[kind]
     log = vp.Log(**change(good(6))).matched(vp.Scene(load("ur5")))
     assert [found.kind for found in log.warnings] == [kind]
-    assert why in log.warnings[0] and len(caplog.messages) == 1
+    assert [why in sentence for sentence in caplog.messages] == [True]
 
 
 def test_a_right_log_is_not_doubted(load, caplog):

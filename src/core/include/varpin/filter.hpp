@@ -34,14 +34,12 @@ struct Estimates {
     double *state = nullptr, *covariance = nullptr;
     double* transition = nullptr;   // (K - 1, d, d) derivative of a prediction in the state before
     double* innovations = nullptr;  // (K, z), NaN where missing
-    double* slopes = nullptr;       // (K, n, 2n) derivatives of the velocities at predictions, if they are measured
+    double* rows = nullptr;         // (K, z, 2n) derivatives of the predicted samples in the state
 };
 
 // Steps of a variational integrator in (q, p).
 class VariationalModel {
   public:
-    static constexpr bool in_momentum = true;
-
     VariationalModel(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
                      const Kernels& kernels)
         : steps_(mechanism, tableau, tolerance, guards, kernels), n_(mechanism.dof()) {}
@@ -66,8 +64,6 @@ class VariationalModel {
 // The same of an explicit method in (q, v).
 class ExplicitModel {
   public:
-    static constexpr bool in_momentum = false;
-
     ExplicitModel(const Mechanism& mechanism, ExplicitMethod method)
         : stepper_(mechanism, method, true), n_(mechanism.dof()), sum_(n_) {}
 
@@ -138,9 +134,12 @@ class Filter {
             }
             std::copy_n(x.begin(), d, to.predicted + k * d);
             std::copy_n(P.begin(), d * d, to.predicted_covariance + k * d * d);
-            double* slopes = to.slopes ? to.slopes + k * 2 * n * n : nullptr;
-            if (slopes && !model_.velocity(x.data(), v.data(), slopes)) return {Outcome::singular, k};
-            update(log, k, slopes, to.innovations + k * log.rows);
+            double* rows = to.rows + k * log.rows * 2 * n;
+            for (int i = 0; i < n; ++i) rows[i * (2 * n + 1)] = 1.0;
+            std::copy_n(x.begin(), n, sample.begin());
+            if (log.rows > n && !model_.velocity(x.data(), sample.data() + n, rows + 2 * n * n))
+                return {Outcome::singular, k};
+            update(log, k, rows, to.innovations + k * log.rows);
             std::copy_n(x.begin(), d, to.state + k * d);
             std::copy_n(P.begin(), d * d, to.covariance + k * d * d);
         }
@@ -151,8 +150,8 @@ class Filter {
     Model& model_;
     const int n, d;
     std::vector<double> x = zeros(d), P = zeros(d, d);
-    std::vector<double> v = zeros(n), x1 = zeros(2 * n), A = zeros(2 * n, 2 * n), B = zeros(2 * n, n);
-    std::vector<double> jumps = zeros(n, n), late = zeros(2 * n, n), step = zeros(d, d), product = zeros(d, d);
+    std::vector<double> sample = zeros(2 * n), x1 = zeros(2 * n), A = zeros(2 * n, 2 * n), B = zeros(2 * n, n);
+    std::vector<double> jumps = zeros(n, n), step = zeros(d, d), product = zeros(d, d);
     std::vector<double> shift = zeros(d), weight = zeros(d);
 
     // Over interval k, with the product of the derivatives of its steps into `transition`.
@@ -219,38 +218,24 @@ class Filter {
     }
 
     // Take sample k, one number after another: their errors are independent, so that this is the joint update, (K2).
-    void update(const LogView& log, std::int64_t k, const double* slopes, double* innovations) {
+    void update(const LogView& log, std::int64_t k, const double* row, double* innovations) {
         std::fill(shift.begin(), shift.end(), 0.0);
-        for (int i = 0; i < log.rows; ++i) {
-            const double z = log.measured[k * log.rows + i], *row = i < n ? nullptr : slopes + (i - n) * 2 * n;
-            innovations[i] = z - (row ? v[i - n] : x[i]);
-            if (!std::isnan(z)) take(innovations[i], log.variance[i], row, i);
-        }
-        for (int c = 0; c < d; ++c) x[c] += shift[c];
-    }
-
-    // One number with its derivative `row` (2n) in the state; null for coordinate i itself.
-    void take(double error, double variance, const double* row, int i) {
-        double sum = variance, left = error;
-        if (row) {
-            for (int r = 0; r < d; ++r) {
-                weight[r] = 0.0;
-                for (int c = 0; c < 2 * n; ++c) weight[r] += P[r * d + c] * row[c];
-            }
+        for (int i = 0; i < log.rows; ++i, row += 2 * n) {
+            innovations[i] = log.measured[k * log.rows + i] - sample[i];
+            if (std::isnan(innovations[i])) continue;
+            double sum = log.variance[i], left = innovations[i];
+            detail::multiply(row, P.data(), 1, 2 * n, d, weight.data());
             for (int c = 0; c < 2 * n; ++c) {
                 sum += row[c] * weight[c];
                 left -= row[c] * shift[c];
             }
-        } else {
-            std::copy_n(P.begin() + i * d, d, weight.begin());
-            sum += weight[i];
-            left -= shift[i];
+            for (int r = 0; r < d; ++r) {
+                const double gain = weight[r] / sum;
+                shift[r] += gain * left;
+                detail::subtract_scaled(P.data() + r * d, gain, weight.data(), 0, d);
+            }
         }
-        for (int r = 0; r < d; ++r) {
-            const double gain = weight[r] / sum;
-            shift[r] += gain * left;
-            detail::subtract_scaled(P.data() + r * d, gain, weight.data(), 0, d);
-        }
+        for (int c = 0; c < d; ++c) x[c] += shift[c];
     }
 };
 
