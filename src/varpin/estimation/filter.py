@@ -216,7 +216,8 @@ def kalman_filter(
 def smooth(scene: Scene, log: Log | Trajectory, *, q_noise: JointValues, **options: Any) -> Estimate:
     """Estimate positions, velocities and external forces at each sample of a log from all of them.
 
-    It is the smoother of Rauch, Tung and Striebel after :func:`kalman_filter`, whose arguments and errors it has.
+    It is the smoother of Rauch, Tung and Striebel after :func:`kalman_filter`, whose arguments and errors it has: (K2)
+    of docs/mathematics.md.
     """
     found = kalman_filter(scene, log, q_noise=q_noise, **options)
     states = _in_velocities(scene, *_backward(found.forward), variational=found.variational)
