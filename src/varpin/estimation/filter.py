@@ -34,6 +34,8 @@ _WIDE = 100.0
 _JITTER = 1.5
 # Excess of an interval over a multiple of the step that makes no further step: rounding.
 _ROUNDING = 1e-6
+# Steps between two samples that are too many: they take hours.
+_MOST = 1e9
 
 # The fields of an estimate that tell of the states.
 _STATES = ("q", "v", "covariance", "external", "external_covariance")
@@ -238,14 +240,16 @@ def _measured(log: Log, q_noise: JointValues, v_noise: JointValues | None) -> tu
 
 def _variance(name: str, value: JointValues, joints: tuple[str, ...]) -> Floats:
     deviation = joint_array(name, value, joints, uniform=True)
-    if not (deviation > 0.0).all():
-        raise InputError(f"{name} must be positive for every joint, got {deviation.min():g}")
-    return deviation**2
+    with np.errstate(over="ignore", under="ignore"):
+        variance: Floats = deviation**2
+    if not ((deviation > 0.0) & (variance > 0.0) & (variance < np.inf)).all():
+        raise InputError(f"{name} must be positive for every joint, as must its square, got {deviation.tolist()}")
+    return variance
 
 
 def _external(given: tuple[JointValues, float], joints: tuple[str, ...], h: Floats) -> tuple[Floats, Floats]:
     """Variances (n,) of external forces, and the share (K - 1,) that steps of length h keep of them."""
-    if not isinstance(given, tuple) or len(given) != 2:
+    if not isinstance(given, tuple | list) or len(given) != 2:
         raise InputError(f"external must be (standard deviation [N m or N], time [s]), got {given!r}")
     strength = _variance("external: standard deviation", given[0], joints)
     return strength, np.exp(-h / positive("external: time", given[1], "s"))
@@ -255,8 +259,10 @@ def _steps(t: Floats, dt: float | None) -> tuple[np.ndarray[tuple[int, ...], np.
     """The number of steps (K - 1,) in each interval, and their length [s]."""
     intervals = np.diff(t)
     longest = _JITTER * float(np.median(intervals)) if dt is None else positive("dt", dt, "s")
-    parts = np.maximum(1, np.ceil(intervals / longest - _ROUNDING)).astype(np.int64)
-    return parts, intervals / parts
+    parts = np.maximum(1, np.ceil(intervals / longest - _ROUNDING))
+    if not parts.max() < _MOST:
+        raise InputError(f"dt = {longest:g} s gives {parts.max():.3g} steps between two samples: take a longer one")
+    return parts.astype(np.int64), intervals / parts
 
 
 def _first_samples(log: Log, variance: Floats) -> tuple[Floats, Floats, Floats, Floats]:

@@ -139,7 +139,7 @@ class Filter {
             std::copy_n(x.begin(), n, sample.begin());
             if (log.rows > n && !model_.velocity(x.data(), sample.data() + n, rows + 2 * n * n))
                 return {Outcome::singular, k};
-            update(log, k, rows, to.innovations + k * log.rows);
+            if (!update(log, k, rows, to.innovations + k * log.rows)) return {Outcome::not_finite, k};
             std::copy_n(x.begin(), d, to.state + k * d);
             std::copy_n(P.begin(), d * d, to.covariance + k * d * d);
         }
@@ -218,7 +218,8 @@ class Filter {
     }
 
     // Take sample k, one number after another: their errors are independent, so that this is the joint update, (K2).
-    void update(const LogView& log, std::int64_t k, const double* row, double* innovations) {
+    // False where the variance of a prediction is no positive number.
+    bool update(const LogView& log, std::int64_t k, const double* row, double* innovations) {
         std::fill(shift.begin(), shift.end(), 0.0);
         for (int i = 0; i < log.rows; ++i, row += 2 * n) {
             innovations[i] = log.measured[k * log.rows + i] - sample[i];
@@ -229,6 +230,7 @@ class Filter {
                 sum += row[c] * weight[c];
                 left -= row[c] * shift[c];
             }
+            if (!(sum > 0.0) || !std::isfinite(sum)) return false;
             for (int r = 0; r < d; ++r) {
                 const double gain = weight[r] / sum;
                 shift[r] += gain * left;
@@ -236,6 +238,7 @@ class Filter {
             }
         }
         for (int c = 0; c < d; ++c) x[c] += shift[c];
+        return true;
     }
 };
 
