@@ -273,6 +273,16 @@ def test_an_external_push_is_found(load, method):
     assert vp.kalman_filter(scene, log_of(q, u), q_noise=ENCODER).external is None
 
 
+def test_noise_of_any_model_that_does_not_see_the_velocity():
+    robot, log = vp.planar_chain(2), vp.Log(**good())
+    F = np.array([[0.3], [0.1]])
+    own = vp.CustomNoise(lambda q, v, u: F * np.cos(q[0]), 1, dq=lambda q, v, u: -np.sin(q[0]) * F[:, :, None] * [1, 0])
+    noise = [vp.ControlNoise(0.2), vp.StateNoise(0.1, center=0.5), own]
+    found = vp.kalman_filter(vp.Scene(robot, noise=noise), log, q_noise=ENCODER)
+    fields = [np.diag(0.2 * log.u[3]), np.diag(0.1 * (log.q[3] - 0.5) ** 2), F * np.cos(log.q[3, 0])]
+    np.testing.assert_allclose(found.given.spread[3], sum(field @ field.T for field in fields), rtol=1e-12)
+
+
 # Logs.
 
 

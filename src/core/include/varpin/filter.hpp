@@ -37,6 +37,27 @@ struct Estimates {
     double* rows = nullptr;         // (K, z, 2n) derivatives of the predicted samples in the state
 };
 
+namespace detail {
+
+// out (rows, columns) = a (rows, depth) b (depth, columns).
+inline void multiply(const double* a, const double* b, int rows, int depth, int columns, double* out) {
+    std::fill(out, out + rows * columns, 0.0);
+    for (int i = 0; i < rows; ++i) {
+        subtract_rows(
+            out + i * columns, columns, 0, depth, [&](int k) { return -a[i * depth + k]; },
+            [&](int k) { return b + k * columns; });
+    }
+}
+
+// Of a (n, n), in place.
+inline void transpose(double* a, int n) {
+    for (int i = 0; i < n; ++i) {
+        for (int j = 0; j < i; ++j) std::swap(a[i * n + j], a[j * n + i]);
+    }
+}
+
+}  // namespace detail
+
 // Steps of a variational integrator in (q, p).
 class VariationalModel {
   public:
@@ -53,7 +74,8 @@ class VariationalModel {
         return steps_.step(h, x, x + n_, force, A, B, x1, x1 + n_);
     }
 
-    // The velocity (n) at x and its derivatives (n, 2n); false where the mass matrix is not positive definite.
+    // The velocity (n) at x and its derivatives, into zeros (n, 2n); false where the mass matrix is not positive
+    // definite.
     bool velocity(const double* x, double* v, double* slopes) { return steps_.velocity(x, x + n_, v, slopes); }
 
   private:
@@ -76,9 +98,7 @@ class ExplicitModel {
         for (int turn = 0; turn < 2; ++turn) {
             // M^-1 times the rows of a symmetric matrix, and then of the transpose of that.
             for (int i = 0; i < n_; ++i) stepper_.dynamics.solve_mass(jumps + i * n_, jumps + i * n_);
-            for (int i = 0; i < n_; ++i) {
-                for (int j = 0; j < i; ++j) std::swap(jumps[i * n_ + j], jumps[j * n_ + i]);
-            }
+            detail::transpose(jumps, n_);
         }
         for (int i = 0; i < n_; ++i) sum_[i] = force[i] + (external ? external[i] : 0.0);
         if (!stepper_.step(h, sum_.data())) return Outcome::singular;
@@ -92,7 +112,6 @@ class ExplicitModel {
 
     bool velocity(const double* x, double* v, double* slopes) {
         std::copy_n(x + n_, n_, v);
-        std::fill(slopes, slopes + 2 * n_ * n_, 0.0);
         for (int i = 0; i < n_; ++i) slopes[i * 2 * n_ + n_ + i] = 1.0;
         return true;
     }
@@ -102,20 +121,6 @@ class ExplicitModel {
     int n_;
     std::vector<double> sum_;
 };
-
-namespace detail {
-
-// out (rows, columns) = a (rows, depth) b (depth, columns).
-inline void multiply(const double* a, const double* b, int rows, int depth, int columns, double* out) {
-    std::fill(out, out + rows * columns, 0.0);
-    for (int i = 0; i < rows; ++i) {
-        subtract_rows(
-            out + i * columns, columns, 0, depth, [&](int k) { return -a[i * depth + k]; },
-            [&](int k) { return b + k * columns; });
-    }
-}
-
-}  // namespace detail
 
 template <class Model>
 class Filter {
@@ -192,9 +197,7 @@ class Filter {
     void spread(double h, const double* added) {
         add_jumps(h / 3.0);
         detail::multiply(step.data(), P.data(), d, d, d, product.data());
-        for (int i = 0; i < d; ++i) {
-            for (int j = 0; j < i; ++j) std::swap(product[i * d + j], product[j * d + i]);
-        }
+        detail::transpose(product.data(), d);
         detail::multiply(step.data(), product.data(), d, d, d, P.data());
         for (int i = 0; i < 2 * n; ++i) {
             for (int j = 0; j < n; ++j) {
