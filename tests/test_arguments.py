@@ -98,6 +98,16 @@ def noisy(kind):
     return lambda **given: of_scene(noise=kind(**given))
 
 
+LOGGED = {"t": [0.0, 0.1, 0.2], "q": np.ones((3, 2)), "u": np.zeros((3, 2))}
+
+
+def filtered(**given):
+    try:
+        return vp.kalman_filter(**({"scene": NOISY, "log": vp.Log(**LOGGED), "q_noise": 1e-3} | given))
+    except vp.LinearizationError:
+        return None  # it names the step
+
+
 START = {"scene": SCENE, "q": [0.0, 0.0], "v": [0.0, 0.0]}
 DISCRETE = {"scene": SCENE, "q0": [0.0, 0.0], "q1": [0.0, 0.0], "dt": 0.1}
 
@@ -137,6 +147,8 @@ FUNCTIONS = {
     "v": (within(vp.discrete_lagrangian, **DISCRETE), "q0 q1 dt alpha"),
     "configuration": (ROBOT.configuration, "q"),
     "propagate_moments": (vp.propagate_moments, "linearization"),
+    "Log": (within(vp.Log, **LOGGED), "t q u v joints controls"),
+    "kalman_filter": (filtered, "log q_noise external dt q0 v0 covariance integrator"),
     "refine": (within(vp.wiener.refine, **FINER), "increments dt rng"),
     "wiener_increments": (lambda dt: vp.wiener.wiener_increments(1, dt, 3, rng=0), "dt"),
     "KeepClear": (within(vp.KeepClear, **CLEAR), "obstacles capsules itself"),
@@ -151,8 +163,8 @@ FUNCTIONS = {
 def require_finite(found) -> None:
     for name in ("t", "q", "v", "p", "u", "dw", "energy"):
         values = getattr(found, name, None)
-        if isinstance(found, vp.Trajectory) or (isinstance(found, vp.Ensemble) and values is not None):
-            assert np.isfinite(values).all() or getattr(found, "failures", ()), name
+        if isinstance(found, vp.Trajectory | vp.Estimate) or (isinstance(found, vp.Ensemble) and values is not None):
+            assert values is None or np.isfinite(values).all() or getattr(found, "failures", ()), name
 
 
 @pytest.mark.parametrize(

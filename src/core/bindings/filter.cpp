@@ -16,7 +16,7 @@ namespace {
 
 using namespace nanobind::literals;
 
-// Moments before and after each sample, transitions, innovations and slopes of velocities, as `Estimates`; why the
+// Moments before and after each sample, transitions, innovations and rows, as `Estimates`; why the
 // filter ended, and the samples that it reached. `log` is the Python named tuple FilterLog.
 using Filtered = std::tuple<Out, Out, Out, Out, Out, Out, Out, std::int64_t, std::int64_t>;
 
@@ -39,7 +39,7 @@ Filtered filter(Model& model, std::size_t n, nb::handle log) {
                        .added = field<In<2>>(log, "added", {N, n})};
     const Out predicted = array_for({K, d}), predicted_covariance = array_for({K, d, d}), state = array_for({K, d}),
               covariance = array_for({K, d, d}), transition = array_for({N, d, d}), innovations = array_for({K, z}),
-              slopes = array_for({z > n ? K : 0, n, 2 * n});
+              rows = array_for({K, z, 2 * n});
     std::copy_n(start.data(), d, predicted.data());
     std::copy_n(field<In<2>>(log, "covariance", {d, d}), d * d, predicted_covariance.data());
     const auto [outcome, done] = [&] {
@@ -51,10 +51,10 @@ Filtered filter(Model& model, std::size_t n, nb::handle log) {
                         .covariance = covariance.data(),
                         .transition = transition.data(),
                         .innovations = innovations.data(),
-                        .slopes = z > n ? slopes.data() : nullptr});
+                        .rows = rows.data()});
     }();
-    return {predicted,  predicted_covariance, state,  covariance,
-            transition, innovations,          slopes, static_cast<std::int64_t>(outcome),
+    return {predicted,  predicted_covariance, state, covariance,
+            transition, innovations,          rows,  static_cast<std::int64_t>(outcome),
             done};
 }
 

@@ -163,7 +163,7 @@ class FilterArrays(NamedTuple):
     covariance: Floats  # (K, d, d)
     transition: Floats  # (K - 1, d, d) derivatives of a prediction in the state before
     innovations: Floats  # (K, z) measured minus predicted, NaN where missing
-    slopes: Floats  # (K, n, 2n) derivatives of predicted velocities in the state; (0, n, 2n) where none are measured
+    rows: Floats  # (K, z, 2n) derivatives of the predicted samples in the state
 
 
 class RolloutArrays(NamedTuple):

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 
 from varpin.arrays import Floats
 from varpin.core.arrays import FilterArrays, FilterLog
@@ -33,6 +34,11 @@ _WIDE = 100.0
 _JITTER = 1.5
 # Excess of an interval over a multiple of the step that makes no further step: rounding.
 _ROUNDING = 1e-6
+# Steps between two samples that are too many: they take hours.
+_MOST = 1e9
+
+# The fields of an estimate that tell of the states.
+_STATES = ("q", "v", "covariance", "external", "external_covariance")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,28 +88,18 @@ class Estimate(Frozen):
         return self.forward.innovations
 
     @cached_property
-    def rows(self) -> Floats:
-        """Derivatives of the predicted samples in the filter's state (K, z, d)."""
-        (K, z), d, n = self.innovations.shape, self.given.mean.size, self.q.shape[1]
-        H = np.zeros((K, z, d))
-        H[:, :n, :n] = np.eye(n)
-        if z > n:
-            H[:, n:, : 2 * n] = self.forward.slopes
-        return H
-
-    @cached_property
     def S(self) -> Floats:
         """Covariances of the innovations (K, z, z)."""
-        H = self.rows
-        found: Floats = H @ self.forward.predicted_covariance @ np.swapaxes(H, 1, 2) + np.diag(self.given.variance)
+        H, P = self.forward.rows, self.forward.predicted_covariance[:, : 2 * self.q.shape[1], : 2 * self.q.shape[1]]
+        found: Floats = H @ P @ np.swapaxes(H, 1, 2) + np.diag(self.given.variance)
         return found
 
     @cached_property
     def gains(self) -> Floats:
         """Gains of the filter (K, d, z): what a unit of an innovation moves the state; 0 for missing samples."""
         S, _, present = self._present
-        HP = self.rows @ self.forward.predicted_covariance * present[:, :, None]
-        return np.swapaxes(np.linalg.solve(S, HP), 1, 2)
+        HP = self.forward.rows @ self.forward.predicted_covariance[:, : 2 * self.q.shape[1]]
+        return np.swapaxes(np.linalg.solve(S, HP * present[:, :, None]), 1, 2)
 
     @cached_property
     def _present(self) -> tuple[Floats, Floats, np.ndarray[tuple[int, ...], np.dtype[np.bool_]]]:
@@ -208,7 +204,7 @@ def kalman_filter(
     strength, kept = np.zeros(n), np.zeros(len(h))
     if external is not None:
         strength, kept = _external(external, joints, h)
-        mean, P = np.concatenate([mean, np.zeros(n)]), _beside(P, np.diag(strength))
+        mean, P = np.concatenate([mean, np.zeros(n)]), block_diag(P, np.diag(strength))
     F = scene.noise.fields(q[:-1], np.zeros_like(q[:-1]), log.u[:-1], q[0]).F
     force, spread = log.u[:-1] @ scene.actuation.T, F @ np.swapaxes(F, 1, 2)
     added = (1.0 - kept[:, None] ** 2) * strength
@@ -219,28 +215,15 @@ def kalman_filter(
     return Estimate(log.t, *states, found, seen, joints, text, variational, warnings=log.warnings)
 
 
-def smooth(
-    scene: Scene,
-    log: Log | Trajectory,
-    *,
-    q_noise: JointValues,
-    v_noise: JointValues | None = None,
-    external: tuple[JointValues, float] | None = None,
-    dt: float | None = None,
-    q0: JointValues | None = None,
-    v0: JointValues | None = None,
-    covariance: ArrayLike | None = None,
-    integrator: Integrator | None = None,
-) -> Estimate:
-    """Estimate positions, velocities and external forces at the samples of a log from all of them.
+def smooth(scene: Scene, log: Log | Trajectory, *, q_noise: JointValues, **options: Any) -> Estimate:
+    """Estimate positions, velocities and external forces at each sample of a log from all of them.
 
-    It is the smoother of Rauch, Tung and Striebel after :func:`kalman_filter`, whose arguments and errors it has.
+    It is the smoother of Rauch, Tung and Striebel after :func:`kalman_filter`, whose arguments and errors it has: (K2)
+    of docs/mathematics.md.
     """
-    options: dict[str, Any] = {"q0": q0, "v0": v0, "covariance": covariance, "integrator": integrator}
-    filtered = kalman_filter(scene, log, q_noise=q_noise, v_noise=v_noise, external=external, dt=dt, **options)
-    states = _in_velocities(scene, *_backward(filtered.forward), variational=filtered.variational)
-    names = ("q", "v", "covariance", "external", "external_covariance")
-    return filtered.changed(**dict(zip(names, states, strict=True)), smoothed=True)
+    found = kalman_filter(scene, log, q_noise=q_noise, **options)
+    states = _in_velocities(scene, *_backward(found.forward), variational=found.variational)
+    return found.changed(**dict(zip(_STATES, states, strict=True)), smoothed=True)
 
 
 def _measured(log: Log, q_noise: JointValues, v_noise: JointValues | None) -> tuple[Floats, Floats]:
@@ -257,14 +240,16 @@ def _measured(log: Log, q_noise: JointValues, v_noise: JointValues | None) -> tu
 
 def _variance(name: str, value: JointValues, joints: tuple[str, ...]) -> Floats:
     deviation = joint_array(name, value, joints, uniform=True)
-    if not (deviation > 0.0).all():
-        raise InputError(f"{name} must be positive for every joint, got {deviation.min():g}")
-    return deviation**2
+    with np.errstate(over="ignore", under="ignore"):
+        variance: Floats = deviation**2
+    if not ((deviation > 0.0) & (variance > 0.0) & (variance < np.inf)).all():
+        raise InputError(f"{name} must be positive for every joint, as must its square, got {deviation.tolist()}")
+    return variance
 
 
 def _external(given: tuple[JointValues, float], joints: tuple[str, ...], h: Floats) -> tuple[Floats, Floats]:
     """Variances (n,) of external forces, and the share (K - 1,) that steps of length h keep of them."""
-    if not isinstance(given, tuple) or len(given) != 2:
+    if not isinstance(given, tuple | list) or len(given) != 2:
         raise InputError(f"external must be (standard deviation [N m or N], time [s]), got {given!r}")
     strength = _variance("external: standard deviation", given[0], joints)
     return strength, np.exp(-h / positive("external: time", given[1], "s"))
@@ -274,8 +259,10 @@ def _steps(t: Floats, dt: float | None) -> tuple[np.ndarray[tuple[int, ...], np.
     """The number of steps (K - 1,) in each interval, and their length [s]."""
     intervals = np.diff(t)
     longest = _JITTER * float(np.median(intervals)) if dt is None else positive("dt", dt, "s")
-    parts = np.maximum(1, np.ceil(intervals / longest - _ROUNDING)).astype(np.int64)
-    return parts, intervals / parts
+    parts = np.maximum(1, np.ceil(intervals / longest - _ROUNDING))
+    if not parts.max() < _MOST:
+        raise InputError(f"dt = {longest:g} s gives {parts.max():.3g} steps between two samples: take a longer one")
+    return parts.astype(np.int64), intervals / parts
 
 
 def _first_samples(log: Log, variance: Floats) -> tuple[Floats, Floats, Floats, Floats]:
@@ -331,13 +318,6 @@ def _backward(found: FilterArrays) -> tuple[Floats, Floats]:
         x[k] += back[k] @ (x[k + 1] - found.predicted[k + 1])
         P[k] += back[k] @ (P[k + 1] - before[k]) @ back[k].T
     return x, 0.5 * (P + np.swapaxes(P, 1, 2))
-
-
-def _beside(a: Floats, b: Floats) -> Floats:
-    """Both matrices on the diagonal of one."""
-    found = np.zeros((len(a) + len(b), len(a) + len(b)))
-    found[: len(a), : len(a)], found[len(a) :, len(a) :] = a, b
-    return found
 
 
 def _squares(S: Floats, e: Floats) -> Floats:

@@ -163,7 +163,7 @@ def as_log(given: Log | Trajectory) -> Log:
         return given
     if not isinstance(given, Trajectory):
         raise InputError(f"a log must be a varpin.Log or a Trajectory, got {type(given).__name__}")
-    return Log(given.t, given.q, given.u[np.minimum(np.arange(len(given.t)), given.steps - 1)], None, given.joint_names)
+    return Log(given.t, given.q, np.vstack([given.u, given.u[-1:]]), None, given.joint_names)
 
 
 def _rows(name: str, given: Any, rows: int) -> Floats:

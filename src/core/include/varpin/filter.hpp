@@ -34,77 +34,7 @@ struct Estimates {
     double *state = nullptr, *covariance = nullptr;
     double* transition = nullptr;   // (K - 1, d, d) derivative of a prediction in the state before
     double* innovations = nullptr;  // (K, z), NaN where missing
-    double* slopes = nullptr;       // (K, n, 2n) derivatives of the velocities at predictions, if they are measured
-};
-
-// Steps of a variational integrator in (q, p).
-class VariationalModel {
-  public:
-    static constexpr bool in_momentum = true;
-
-    VariationalModel(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                     const Kernels& kernels)
-        : steps_(mechanism, tableau, tolerance, guards, kernels), n_(mechanism.dof()) {}
-
-    // The end x1 (2n) of a step from x and its derivatives in x and in the external force (n), which may be null; and
-    // the covariance (n, n) in a unit of time of the jumps of noise of `spread`.
-    Outcome step(double h, const double* x, const double* force, const double* external, const double* spread,
-                 double* x1, double* A, double* B, double* jumps) {
-        std::copy_n(spread, n_ * n_, jumps);
-        steps_.take_external(external);
-        return steps_.step(h, x, x + n_, force, A, B, x1, x1 + n_);
-    }
-
-    // The velocity (n) at x and its derivatives (n, 2n); false where the mass matrix is not positive definite.
-    bool velocity(const double* x, double* v, double* slopes) { return steps_.velocity(x, x + n_, v, slopes); }
-
-  private:
-    VariationalLinearization steps_;
-    int n_;
-};
-
-// The same of an explicit method in (q, v).
-class ExplicitModel {
-  public:
-    static constexpr bool in_momentum = false;
-
-    ExplicitModel(const Mechanism& mechanism, ExplicitMethod method)
-        : stepper_(mechanism, method, true), n_(mechanism.dof()), sum_(n_) {}
-
-    Outcome step(double h, const double* x, const double* force, const double* external, const double* spread,
-                 double* x1, double* A, double* B, double* jumps) {
-        std::copy_n(x, n_, stepper_.q.begin());
-        std::copy_n(x + n_, n_, stepper_.v.begin());
-        if (!stepper_.dynamics.at(x, x + n_)) return Outcome::singular;
-        std::copy_n(spread, n_ * n_, jumps);
-        for (int turn = 0; turn < 2; ++turn) {
-            // M^-1 times the rows of a symmetric matrix, and then of the transpose of that.
-            for (int i = 0; i < n_; ++i) stepper_.dynamics.solve_mass(jumps + i * n_, jumps + i * n_);
-            for (int i = 0; i < n_; ++i) {
-                for (int j = 0; j < i; ++j) std::swap(jumps[i * n_ + j], jumps[j * n_ + i]);
-            }
-        }
-        for (int i = 0; i < n_; ++i) sum_[i] = force[i] + (external ? external[i] : 0.0);
-        if (!stepper_.step(h, sum_.data())) return Outcome::singular;
-        std::fill(A, A + 4 * n_ * n_, 0.0);
-        std::fill(B, B + 2 * n_ * n_, 0.0);
-        stepper_.write_derivatives(h, A, B);
-        std::copy_n(stepper_.q.begin(), n_, x1);
-        std::copy_n(stepper_.v.begin(), n_, x1 + n_);
-        return Outcome::solved;
-    }
-
-    bool velocity(const double* x, double* v, double* slopes) {
-        std::copy_n(x + n_, n_, v);
-        std::fill(slopes, slopes + 2 * n_ * n_, 0.0);
-        for (int i = 0; i < n_; ++i) slopes[i * 2 * n_ + n_ + i] = 1.0;
-        return true;
-    }
-
-  private:
-    ExplicitStepper stepper_;
-    int n_;
-    std::vector<double> sum_;
+    double* rows = nullptr;         // (K, z, 2n) derivatives of the predicted samples in the state
 };
 
 namespace detail {
@@ -119,7 +49,78 @@ inline void multiply(const double* a, const double* b, int rows, int depth, int 
     }
 }
 
+// Of a (n, n), in place.
+inline void transpose(double* a, int n) {
+    for (int i = 0; i < n; ++i) {
+        for (int j = 0; j < i; ++j) std::swap(a[i * n + j], a[j * n + i]);
+    }
+}
+
 }  // namespace detail
+
+// Steps of a variational integrator in (q, p).
+class VariationalModel {
+  public:
+    VariationalModel(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
+                     const Kernels& kernels)
+        : steps_(mechanism, tableau, tolerance, guards, kernels), n_(mechanism.dof()) {}
+
+    // The end x1 (2n) of a step from x and its derivatives in x and in the external force (n), which may be null; and
+    // the covariance (n, n) in a unit of time of the jumps of noise of `spread`.
+    Outcome step(double h, const double* x, const double* force, const double* external, const double* spread,
+                 double* x1, double* A, double* B, double* jumps) {
+        std::copy_n(spread, n_ * n_, jumps);
+        steps_.take_external(external);
+        return steps_.step(h, x, x + n_, force, A, B, x1, x1 + n_);
+    }
+
+    // The velocity (n) at x and its derivatives, into zeros (n, 2n); false where the mass matrix is not positive
+    // definite.
+    bool velocity(const double* x, double* v, double* slopes) { return steps_.velocity(x, x + n_, v, slopes); }
+
+  private:
+    VariationalLinearization steps_;
+    int n_;
+};
+
+// The same of an explicit method in (q, v).
+class ExplicitModel {
+  public:
+    ExplicitModel(const Mechanism& mechanism, ExplicitMethod method)
+        : stepper_(mechanism, method, true), n_(mechanism.dof()), sum_(n_) {}
+
+    Outcome step(double h, const double* x, const double* force, const double* external, const double* spread,
+                 double* x1, double* A, double* B, double* jumps) {
+        std::copy_n(x, n_, stepper_.q.begin());
+        std::copy_n(x + n_, n_, stepper_.v.begin());
+        if (!stepper_.dynamics.at(x, x + n_)) return Outcome::singular;
+        std::copy_n(spread, n_ * n_, jumps);
+        for (int turn = 0; turn < 2; ++turn) {
+            // M^-1 times the rows of a symmetric matrix, and then of the transpose of that.
+            for (int i = 0; i < n_; ++i) stepper_.dynamics.solve_mass(jumps + i * n_, jumps + i * n_);
+            detail::transpose(jumps, n_);
+        }
+        for (int i = 0; i < n_; ++i) sum_[i] = force[i] + (external ? external[i] : 0.0);
+        if (!stepper_.step(h, sum_.data())) return Outcome::singular;
+        std::fill(A, A + 4 * n_ * n_, 0.0);
+        std::fill(B, B + 2 * n_ * n_, 0.0);
+        stepper_.write_derivatives(h, A, B);
+        std::copy_n(stepper_.q.begin(), n_, x1);
+        std::copy_n(stepper_.v.begin(), n_, x1 + n_);
+        return Outcome::solved;
+    }
+
+    bool velocity(const double* x, double* v, double* slopes) {
+        std::copy_n(x + n_, n_, v);
+        for (int i = 0; i < n_; ++i) slopes[i * 2 * n_ + n_ + i] = 1.0;
+        return true;
+    }
+
+  private:
+    ExplicitStepper stepper_;
+    int n_;
+    std::vector<double> sum_;
+};
 
 template <class Model>
 class Filter {
@@ -138,9 +139,12 @@ class Filter {
             }
             std::copy_n(x.begin(), d, to.predicted + k * d);
             std::copy_n(P.begin(), d * d, to.predicted_covariance + k * d * d);
-            double* slopes = to.slopes ? to.slopes + k * 2 * n * n : nullptr;
-            if (slopes && !model_.velocity(x.data(), v.data(), slopes)) return {Outcome::singular, k};
-            update(log, k, slopes, to.innovations + k * log.rows);
+            double* rows = to.rows + k * log.rows * 2 * n;
+            for (int i = 0; i < n; ++i) rows[i * (2 * n + 1)] = 1.0;
+            std::copy_n(x.begin(), n, sample.begin());
+            if (log.rows > n && !model_.velocity(x.data(), sample.data() + n, rows + 2 * n * n))
+                return {Outcome::singular, k};
+            if (!update(log, k, rows, to.innovations + k * log.rows)) return {Outcome::not_finite, k};
             std::copy_n(x.begin(), d, to.state + k * d);
             std::copy_n(P.begin(), d * d, to.covariance + k * d * d);
         }
@@ -151,8 +155,8 @@ class Filter {
     Model& model_;
     const int n, d;
     std::vector<double> x = zeros(d), P = zeros(d, d);
-    std::vector<double> v = zeros(n), x1 = zeros(2 * n), A = zeros(2 * n, 2 * n), B = zeros(2 * n, n);
-    std::vector<double> jumps = zeros(n, n), late = zeros(2 * n, n), step = zeros(d, d), product = zeros(d, d);
+    std::vector<double> sample = zeros(2 * n), x1 = zeros(2 * n), A = zeros(2 * n, 2 * n), B = zeros(2 * n, n);
+    std::vector<double> jumps = zeros(n, n), step = zeros(d, d), product = zeros(d, d);
     std::vector<double> shift = zeros(d), weight = zeros(d);
 
     // Over interval k, with the product of the derivatives of its steps into `transition`.
@@ -193,9 +197,7 @@ class Filter {
     void spread(double h, const double* added) {
         add_jumps(h / 3.0);
         detail::multiply(step.data(), P.data(), d, d, d, product.data());
-        for (int i = 0; i < d; ++i) {
-            for (int j = 0; j < i; ++j) std::swap(product[i * d + j], product[j * d + i]);
-        }
+        detail::transpose(product.data(), d);
         detail::multiply(step.data(), product.data(), d, d, d, P.data());
         for (int i = 0; i < 2 * n; ++i) {
             for (int j = 0; j < n; ++j) {
@@ -219,38 +221,27 @@ class Filter {
     }
 
     // Take sample k, one number after another: their errors are independent, so that this is the joint update, (K2).
-    void update(const LogView& log, std::int64_t k, const double* slopes, double* innovations) {
+    // False where the variance of a prediction is no positive number.
+    bool update(const LogView& log, std::int64_t k, const double* row, double* innovations) {
         std::fill(shift.begin(), shift.end(), 0.0);
-        for (int i = 0; i < log.rows; ++i) {
-            const double z = log.measured[k * log.rows + i], *row = i < n ? nullptr : slopes + (i - n) * 2 * n;
-            innovations[i] = z - (row ? v[i - n] : x[i]);
-            if (!std::isnan(z)) take(innovations[i], log.variance[i], row, i);
-        }
-        for (int c = 0; c < d; ++c) x[c] += shift[c];
-    }
-
-    // One number with its derivative `row` (2n) in the state; null for coordinate i itself.
-    void take(double error, double variance, const double* row, int i) {
-        double sum = variance, left = error;
-        if (row) {
-            for (int r = 0; r < d; ++r) {
-                weight[r] = 0.0;
-                for (int c = 0; c < 2 * n; ++c) weight[r] += P[r * d + c] * row[c];
-            }
+        for (int i = 0; i < log.rows; ++i, row += 2 * n) {
+            innovations[i] = log.measured[k * log.rows + i] - sample[i];
+            if (std::isnan(innovations[i])) continue;
+            double sum = log.variance[i], left = innovations[i];
+            detail::multiply(row, P.data(), 1, 2 * n, d, weight.data());
             for (int c = 0; c < 2 * n; ++c) {
                 sum += row[c] * weight[c];
                 left -= row[c] * shift[c];
             }
-        } else {
-            std::copy_n(P.begin() + i * d, d, weight.begin());
-            sum += weight[i];
-            left -= shift[i];
+            if (!(sum > 0.0) || !std::isfinite(sum)) return false;
+            for (int r = 0; r < d; ++r) {
+                const double gain = weight[r] / sum;
+                shift[r] += gain * left;
+                detail::subtract_scaled(P.data() + r * d, gain, weight.data(), 0, d);
+            }
         }
-        for (int r = 0; r < d; ++r) {
-            const double gain = weight[r] / sum;
-            shift[r] += gain * left;
-            detail::subtract_scaled(P.data() + r * d, gain, weight.data(), 0, d);
-        }
+        for (int c = 0; c < d; ++c) x[c] += shift[c];
+        return true;
     }
 };
 

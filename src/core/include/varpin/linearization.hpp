@@ -78,10 +78,17 @@ class VariationalLinearization {
         return in_parts(h, q, p, force, halvings, Jx, Jf, Jr, Jp);
     }
 
-    // The same in the parts that the guards require, with its end.
+    // The same of the next step of a path that has been moved to (q, p), in the parts that the guards require, with its
+    // end.
     Outcome step(double h, const double* q, const double* p, const double* force, double* Jx, double* Jf, double* q1,
                  double* p1) {
-        const Outcome outcome = in_parts(h, q, p, force, {}, Jx, Jf, nullptr);
+        stepper.take_force(force, varies);
+        Outcome outcome = stepper.step_from(h, q, p, state);
+        if (outcome == Outcome::solved) {
+            stepper.equation.derivatives(h, dV, Jx, Jf);
+        } else {
+            outcome = in_parts(h, q, p, force, {}, Jx, Jf, nullptr);
+        }
         std::copy(state.q.begin(), state.q.end(), q1);
         std::copy(state.momentum.begin(), state.momentum.end(), p1);
         return outcome;
@@ -99,7 +106,7 @@ class VariationalLinearization {
 
     // v = M(q)^-1 p and its derivatives (n, 2n) in (q, p); false where M(q) is not positive definite.
     bool velocity(const double* q, const double* p, double* v, double* slopes) {
-        if (!stepper.begin_at(q, p, state)) return false;
+        if (!stepper.move_to(q, p, state)) return false;
         std::copy(state.v.begin(), state.v.end(), v);
         stepper.equation.kernels.velocity_slopes(stepper.mechanism, 1, q, v, slopes);
         return true;

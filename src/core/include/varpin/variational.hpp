@@ -129,13 +129,7 @@ class VariationalStepper {
     // Start a path at (q, p) without history; false where M(q) is not positive definite. With `project`, constraints
     // absorb the part of p that is normal to them.
     bool begin_at(const double* q, const double* p, PathState& state, bool project = true) {
-        for (int i = 0; i < n; ++i) {
-            state.position[i] = {{q[i], 0.0}, 0.0};
-            unwind(i, state);
-            state.q[i] = q[i];
-            state.p[i] = {p[i], 0.0};
-            state.momentum[i] = p[i];
-        }
+        place(q, p, state);
         diffusion_centers(mechanism, q, state.center.data());
         state.known = state.level = state.trend = state.impulse_trend = 0;
         if (!enter(state, project)) return false;
@@ -178,6 +172,27 @@ class VariationalStepper {
         if (varies) given = force;
         take_goals(1);
         if (rates) take_rates(rates);
+    }
+
+    // Move a path to (q, p); false where M(q) is not positive definite. Its past stays, for guesses.
+    bool move_to(const double* q, const double* p, PathState& state) {
+        place(q, p, state);
+        return factor_at(state);
+    }
+
+    // One step with the force that was set, in one part, of a path that has been moved to (q, p) since its last step.
+    // Its guess is that of the path, and it leaves the jets at the root in `equation`.
+    Outcome step_from(double h, const double* q, const double* p, PathState& state) {
+        if (!move_to(q, p, state)) return Outcome::singular;
+        energy_guard.begin(at.data(), state.momentum.data(), state.v.data(), state.energies);
+        if (state.known > 0) {
+            extrapolate(h, state);
+        } else {
+            guess_velocity(state);
+        }
+        const Outcome outcome = attempt(h, state, true);
+        if (outcome == Outcome::solved) remember(state);
+        return outcome;
     }
 
     // Interpolate a varying force to the stages of the part of the step at `begin` with length `share`, both in units
@@ -269,6 +284,16 @@ class VariationalStepper {
           m(rows),
           stages(tableau.stages),
           trial(n) {}
+
+    void place(const double* q, const double* p, PathState& state) const {
+        for (int i = 0; i < n; ++i) {
+            state.position[i] = {{q[i], 0.0}, 0.0};
+            unwind(i, state);
+            state.q[i] = q[i];
+            state.p[i] = {p[i], 0.0};
+            state.momentum[i] = p[i];
+        }
+    }
 
     // What differs under constraints.
 
