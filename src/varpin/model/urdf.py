@@ -42,7 +42,7 @@ _WORDS = ("", "none", "nan")  # by which files say so
 # Longest text of Pinocchio's own in a message.
 _COMPLAINT = 150
 
-_COMMENT = re.compile(rb"<!--.*?-->|(<!\[CDATA\[.*?\]\]>)", re.DOTALL)
+COMMENT = re.compile(rb"<!--.*?-->|(<!\[CDATA\[.*?\]\]>)", re.DOTALL)
 
 # One thread at a time redirects the stderr of the process.
 _STDERR = threading.Lock()
@@ -223,7 +223,7 @@ def read_xml(path: Path, text: str | None = None, kind: str = "") -> ET.Element:
     if content.startswith(LFS_POINTER):
         raise RobotError(f"{path} is a Git LFS pointer, not the file itself: git lfs pull downloads it")
     # Comments often contain "--", which XML forbids. Their line breaks stay, for line numbers.
-    content = _COMMENT.sub(lambda found: found[1] or b"\n" * found[0].count(b"\n"), content.lstrip(b" \t\r\n"))
+    content = COMMENT.sub(lambda found: found[1] or b"\n" * found[0].count(b"\n"), content.lstrip(b" \t\r\n"))
     builder, parser = ET.TreeBuilder(), expat.ParserCreate()
     parser.StartElementHandler = lambda tag, has: builder.start(tag, {key: text.strip() for key, text in has.items()})
     parser.EndElementHandler = builder.end
