@@ -9,6 +9,7 @@ from rich.console import Console
 
 from varpin._version import __version__
 from varpin.cli.console import INTERRUPTED, MISTAKE, Parser, complain, logged, say
+from varpin.cli.fits import add_identify
 from varpin.cli.interrupts import Interrupts
 from varpin.cli.runs import add_simulate, add_solve
 from varpin.cli.studies import add_advise, add_extremes, add_tradeoff
@@ -25,6 +26,7 @@ examples:
   varpin replay plan.npz --robot finger_tracking
   varpin advise ur5 --tolerance 1e-6 --duration 1
   varpin extremes finger --out finger-extremes
+  varpin identify ur5 log.csv --parameters damping payload --q-noise 2e-4 --save ur5-found.urdf
 """
 
 
@@ -47,6 +49,7 @@ def _parser() -> Parser:
         ("tradeoff", add_tradeoff, "measure speed against accuracy"),
         ("advise", add_advise, "find the cheapest integrator and step"),
         ("extremes", add_extremes, "run every integrator where it is hard"),
+        ("identify", add_identify, "find parameters of a robot from logs"),
     ):
         add(commands.add_parser(name, help=text, allow_abbrev=False))
     return parser

@@ -23,12 +23,18 @@ from varpin.trajectory import Trajectory
 
 
 def add_outputs(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add options for the files that a command writes."""
+    """Add options for the files that a command writes of a motion."""
+    save = f"write the {what}, for {what.title()}.load"
+    add_replay_options(add_files(parser, "NPZ", save, "draw an overview, as png, pdf or svg"))
+
+
+def add_files(parser: argparse.ArgumentParser, ending: str, save: str, plot: str) -> argparse._ActionsContainer:
+    """Add ``--save``, ``--plot`` and ``--quiet``; returns their group."""
     outputs = parser.add_argument_group("outputs")
-    outputs.add_argument("--save", type=Path, metavar="NPZ", help=f"write the {what}, for {what.title()}.load")
-    outputs.add_argument("--plot", type=Path, metavar="PNG", help="draw an overview, as png, pdf or svg")
-    add_replay_options(outputs)
+    outputs.add_argument("--save", type=Path, metavar=ending, help=save)
+    outputs.add_argument("--plot", type=Path, metavar="PNG", help=plot)
     outputs.add_argument("--quiet", action="store_true", help="print warnings and errors only")
+    return outputs
 
 
 def add_replay_options(outputs: argparse._ActionsContainer) -> None:
@@ -40,21 +46,29 @@ def add_replay_options(outputs: argparse._ActionsContainer) -> None:
     outputs.add_argument("--speed", type=float, metavar="X", help=text)
 
 
-# Functions that write a motion of a robot, or the solution that it is of, by the path of the file.
-Writers = dict[Path, Callable[[Robot, Trajectory, Trajectory | Solution], object]]
+# Functions that write a result, such as a robot, its motion and the solution that it is of, by the path of the file.
+Writers = dict[Path, Callable[..., object]]
+# Endings of figures.
+PICTURES = (".png", ".pdf", ".svg")
 MarksOf = Callable[[float], Marks]
 
 
 def writers_of(request: argparse.Namespace, marks: MarksOf | None = None) -> Writers:
-    """Writers of the requested files, the most important first; what can fail before the run fails here."""
-    found: Writers = {}
+    """Writers of the requested files of a motion, the most important first."""
     show = partial(_show, speed_of(request), request.trace, marks)
-    for option, endings, write in (
+    return files_of(
+        request,
         ("save", (".npz",), _save),
-        ("plot", (".png", ".pdf", ".svg"), _plot),
+        ("plot", PICTURES, _plot),
         ("html", (".html", ".htm"), partial(show, "html")),
         ("video", FORMATS, partial(show, "video")),
-    ):
+    )
+
+
+def files_of(request: argparse.Namespace, *options: tuple[str, Sequence[str], Callable[..., object]]) -> Writers:
+    """Writers of the requested files, by option, endings and function; what can fail before the run fails here."""
+    found: Writers = {}
+    for option, endings, write in options:
         path: Path | None = getattr(request, option, None)
         if path is None:
             continue
@@ -76,7 +90,11 @@ def _save(path: Path, _robot: Robot, _trajectory: Trajectory, result: Trajectory
 def _plot(path: Path, robot: Robot, trajectory: Trajectory, _result: Trajectory | Solution) -> None:
     from varpin.show.plots import plot_trajectory  # noqa: PLC0415 - matplotlib is slow to import
 
-    figure, _ = plot_trajectory(trajectory, robot=robot)
+    save_figure(path, plot_trajectory(trajectory, robot=robot)[0])
+
+
+def save_figure(path: Path, figure: Any) -> None:
+    """Write a figure in the format of the path."""
     with atomic_file(path) as stream:
         figure.savefig(stream, format=path.suffix[1:].lower(), dpi=150)
 
@@ -104,12 +122,7 @@ def speed_of(request: argparse.Namespace) -> float:
 
 
 def write_all(
-    request: argparse.Namespace,
-    errors: Console,
-    files: Writers,
-    robot: Robot,
-    trajectory: Trajectory,
-    result: Trajectory | Solution,
+    request: argparse.Namespace, errors: Console, files: Writers, *result: object
 ) -> tuple[list[tuple[str, Path]], int]:
     """Write files, and print an error for each that cannot be written; rows that name the others, and the exit status.
 
@@ -122,7 +135,7 @@ def write_all(
             continue
         try:
             with interrupts.written():
-                write(robot, trajectory, result)
+                write(*result)
         except (VarpinError, OSError) as error:
             complain(errors, f"{path} was not written: {error}")
             status = MISTAKE

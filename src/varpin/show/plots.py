@@ -17,14 +17,16 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
-from varpin.model import Robot, require_robot
+from varpin.model import Robot, joint_unit, require_robot
 from varpin.show.given import motion_of, problem_of
+from varpin.support.checks import count, tuple_of
 from varpin.trajectory import Trajectory, kinematic_input_rows, require_trajectory, scene_indices
 
 if TYPE_CHECKING:
     # Imported for types alone: plotting a joint needs no optimizer.
     from varpin.control import Solution
     from varpin.control.mpc import MpcRun
+    from varpin.estimation import Identification
     from varpin.study.record import Study
 
 Motion: TypeAlias = "Trajectory | Solution | MpcRun"
@@ -193,6 +195,47 @@ def plot_study(study: Study[Any], axes: Axes | None = None, **options: str) -> t
     axes.legend(frameon=False, fontsize="small")
     axes.set(xlabel=chart.labels[0], ylabel=chart.labels[1])
     return figure, axes
+
+
+def plot_identification(
+    found: Identification, joints: str | Sequence[str] | None = None, *, log: int = 0
+) -> tuple[Figure, NDArray[Any]]:
+    """Measured positions of a log, and those of the motion before and after the identification; below, residuals.
+
+    Args:
+        found: From :func:`varpin.identify`.
+        joints: Names of joints; all if left out.
+        log: Index of the log in ``found.logs``.
+
+    Returns:
+        The figure and its panels: one for each joint, whose range is that of the samples, and one of residuals.
+
+    Raises:
+        InputError: ``found`` is no identification, or has no such log.
+        UnknownJoint: There is no such joint.
+    """
+    if not hasattr(found, "predicted_before"):
+        raise InputError(f"this figure is of an identification, from varpin.identify, got {type(found).__name__}")
+    if count("log", log) >= len(found.logs):
+        raise InputError(f"log must be the index of one of the {len(found.logs)} logs, got {log}")
+    robot, given = found.scene.robot, (joints,) if isinstance(joints, str) else joints
+    names = robot.joint_names if given is None else tuple_of("joints", given, str)
+    chosen, t, samples = [robot.coordinate(name) for name in names], found.logs[log].t, found.logs[log].q
+    figure = Figure(figsize=(9.0, 1.6 * len(chosen) + 2.5), layout="constrained")
+    panels = figure.subplots(len(chosen) + 1, 1, sharex=True, height_ratios=[*[2] * len(chosen), 3])
+    for c, panel, style in zip(chosen, panels, _styles(len(chosen)), strict=False):
+        panel.plot(t, samples[:, c], ".", label="measured", color="0.6", markersize=4)
+        panel.set_ylim(panel.get_ylim())  # the motion before may be far away
+        panel.plot(t, found.predicted_before[log][:, c], label="before", color=COLORS[1], linestyle="--")
+        panel.plot(t, found.predicted[log][:, c], label="after", color=COLORS[0], linewidth=1.2)
+        panel.set_ylabel(f"{robot.joint_names[c]}\n[{joint_unit(robot, c)}]")
+        panels[-1].plot(t, found.residuals[log][:, c], label=robot.joint_names[c], **{**style, "linewidth": 0.8})
+    panels[-1].set(xlabel="time [s]", ylabel=f"residual [{joint_unit(robot, chosen)}]", xlim=(t[0], t[-1]))
+    for panel in panels:
+        apply_style(panel)
+    _share_legend(figure, panels)
+    figure.align_ylabels()
+    return figure, panels
 
 
 def apply_style(axes: Axes) -> None:
