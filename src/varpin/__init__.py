@@ -207,7 +207,9 @@ _LATE = {
     ),
     "varpin.control.mpc": "Mpc MpcRun Plant",
     "varpin.ensemble": ("Ensemble EnsembleInterrupted EnsembleStatistics PathFailure simulate_ensemble"),
-    "varpin.estimation": "Estimate Gradient Identification Log Sensitivities identify kalman_filter sensitivities smooth",
+    "varpin.estimation": (
+        "Estimate Gradient Identification Log Sensitivities identify kalman_filter sensitivities smooth"
+    ),
     "varpin.io.scenefile": "SceneFile SceneFileError load_scene",
     "varpin.linearization": "Curvature Linearization Moments linearize propagate_moments second_order",
     "varpin.model.clearance": "Obstacle",

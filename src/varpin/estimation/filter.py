@@ -239,6 +239,7 @@ def _measured(log: Log, q_noise: JointValues, v_noise: JointValues | None) -> tu
 
 
 def variances(name: str, value: JointValues, joints: tuple[str, ...]) -> Floats:
+    """Squares (n,) of standard deviations: one number, (n,) or by joint name, > 0."""
     deviation = joint_array(name, value, joints, uniform=True)
     with np.errstate(over="ignore", under="ignore"):
         variance: Floats = deviation**2

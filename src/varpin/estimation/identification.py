@@ -9,6 +9,8 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import scipy
@@ -133,8 +135,7 @@ def identify(
 
     In a scene without noise it minimizes the simulation error: motions under the logged controls, from starts that are
     found, too, against the samples. In a scene with noise it minimizes the errors of the one-step predictions of
-    :func:`kalman_filter`. Both are SciPy's least squares on exact derivatives, (I1) of docs/mathematics.md. Bodies whose
-    ten inertial numbers are all parameters stay such as a rigid body can have, and near the scene's where the logs do
+    :func:`kalman_filter`. Both are least squares on exact derivatives, (I1) of docs/mathematics.md. Bodies whose ten inertial numbers are all parameters stay such as a rigid body can have, and near the scene's where the logs do
     not tell: their prior is a factor of e, (I2).
 
     Main args:
@@ -333,7 +334,7 @@ class _Run:
         """The log in stretches of about the horizon, or this much shorter."""
         parts = finer * max(1, round(self.duration / self.fit.horizon))
         ends = np.unique(self.steps * np.arange(parts + 1) // parts)
-        found = [_Stretch(self, int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        found = [_Stretch(self, a, b) for a, b in pairwise(ends.tolist())]
         return [each for each in found if each.samples.any()]
 
 
@@ -508,7 +509,7 @@ def _innovations(fit: _Fit, run: _Run, scene: Scene, varied: Sequence[Varied], l
     B = linearize_steps(scene, motion, fit.integrator, q[0]).B
     more = np.concatenate([D, B @ by_delay[:, :, None]], axis=2)
     x, rows = np.zeros((2 * n, more.shape[2])), []
-    for k, (H, gain) in enumerate(zip(seen.rows, seen.gains, strict=True)):
+    for k, (H, gain) in enumerate(zip(seen.forward.rows, seen.gains, strict=True)):
         if k:
             x = seen.forward.transition[k - 1] @ x + more[k - 1]
         rows.append(-H @ x)
@@ -551,13 +552,14 @@ def _made(fit: _Fit, y: Floats, runs: Sequence[_Run], apart: Sequence[_Run], sta
         predicted.append(_positions(run, stretches, scene, late))
         before.append(_positions(run, stretches, fit.of.scene, 0.0 if fit.delay is None else fit.delay))
     residuals = tuple(run.log.q - own for run, own in zip([*runs, *apart], predicted, strict=True))
-    known = len(runs)
     deviation = float(np.sqrt(covariance[P, P])) if fit.delay is None else 0.0
+    known, of = len(runs), fit.of
+    motions: dict[str, Any] = {"predicted": predicted[:known], "predicted_before": before[:known]}
+    motions |= {"residuals": residuals[:known], "held_out": residuals[known:], "logs": [run.log for run in runs]}
     made = Identification(
-        fit.of.names, values, fit.of.values, fit.of.units, covariance[:P, :P], late,
-        deviation, null, scene,
-        tuple(run.log for run in runs), tuple(predicted[:known]), tuple(before[:known]), residuals[:known],
-        residuals[known:], status,
+        names=of.names, values=values, start=of.values, units=of.units, covariance=covariance[:P, :P], delay=late,
+        delay_deviation=deviation, null_space=null, scene=scene, status=status,
+        **{name: tuple(each) for name, each in motions.items()},
     )  # fmt: skip
     found = tuple(_doubts(fit, made))
     announce(logger, fit.of.scene.announced, fit.dt, found)
