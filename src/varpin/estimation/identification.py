@@ -13,7 +13,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import scipy
+from scipy.optimize import lsq_linear
 
 from varpin.arrays import Floats
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
@@ -21,11 +21,11 @@ from varpin.estimation.consistency import Body
 from varpin.estimation.filter import kalman_filter, variances
 from varpin.estimation.log import Log, as_log
 from varpin.estimation.parameters import INERTIAL, Parameters, parameters_of
-from varpin.estimation.sensitivity import momentum_change
+from varpin.estimation.sensitivity import motion_map
 from varpin.finding import Finding, announce
 from varpin.integrators import Gauss, Integrator
 from varpin.integrators.base import Varied
-from varpin.linearization import linearize_steps, node_jets, velocity_at_nodes
+from varpin.linearization import linearize_steps
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.signals.commands import open_loop
 from varpin.simulation.choice import given_integrator
@@ -53,6 +53,11 @@ _LATEST = 0.1
 _NOTHING = 1e-7
 # Coefficients of a combination below this share of its largest are rounding.
 _NAMED = 1e-3
+# Damping of a step in units of the squared column sizes: where steps are right it vanishes, after a step that was not
+# it begins here, and where no step helps any more it ends.
+_LEAST_DAMPING, _FIRST_DAMPING, _MOST_DAMPING = 1e-12, 1e-3, 1e6
+# The bounds of a step must differ [in the parameters' units].
+_OPEN = 1e-300
 # Standard deviations of a delay, and residuals in units of the encoders' noise, that are told.
 _SURE, _MISFIT = 4.0, 2.0
 # Residual in units of the noise that stands for a motion that cannot be simulated.
@@ -133,10 +138,11 @@ def identify(
 ) -> Identification:
     """Identify parameters of a scene from logs of its arm.
 
-    In a scene without noise it minimizes the simulation error: motions under the logged controls, from starts that are
-    found, too, against the samples. In a scene with noise it minimizes the errors of the one-step predictions of
-    :func:`kalman_filter`. Both are least squares on exact derivatives, (I1) of docs/mathematics.md. Bodies whose ten inertial numbers are all parameters stay such as a rigid body can have, and near the scene's where the logs do
-    not tell: their prior is a factor of e, (I2).
+    In a scene without noise it minimizes the simulation error: motions under the logged controls, over the horizon and
+    from starts that are found, too, against the samples. In a scene with noise it minimizes the errors of the one-step
+    predictions of :func:`kalman_filter`. Both are least squares on exact derivatives, (I1) of docs/mathematics.md.
+    Bodies whose ten inertial numbers are all parameters stay such as a rigid body can have, and near the scene's where
+    the logs do not tell: their prior is a factor of e, (I2).
 
     Main args:
         scene: The scene; its values are where the search begins.
@@ -252,46 +258,42 @@ class _Fit:
         self, evaluate: Callable[[Floats], tuple[Floats, Floats]], y: Floats, tolerance: float, evaluations: int
     ) -> tuple[Floats, str]:
         """The y of least squares from ``y``, and how it ended."""
-        known: dict[bytes, tuple[Floats, Floats]] = {}
-        self.best, self.least = y, np.inf
-        prior = [c for columns, _ in self.bodies for c in columns]
-
-        def at(x: Floats) -> tuple[Floats, Floats]:
-            if (key := x.tobytes()) not in known:
-                r, J = evaluate(x)
-                known.clear()
-                known[key] = np.concatenate([r, x[prior]]), np.concatenate([J, np.eye(self.size)[prior]])
-                self.done += 1
-                cost = float(r @ r)
-                if cost < self.least:
-                    self.best, self.least, self.jacobian = x.copy(), cost, J
-                if self.callback is not None:
-                    self.callback(self.done, float(np.sqrt(cost / len(r))))
-            return known[key]
-
-        P = len(self.of.names)
+        P, prior = len(self.of.names), [c for columns, _ in self.bodies for c in columns]
         lower, upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
         lower[:P] = np.where(np.isin(np.arange(P), prior), -np.inf, self.of.least)
         lower[P:], upper[P:] = -_LATEST, _LATEST
-        y = np.clip(y, lower, upper)
-        r, J = at(y)
-        sizes = np.linalg.norm(J, axis=0)
-        # A first step may explain all residuals by one parameter; a start at 0 has no size of its own.
-        scale = np.divide(np.linalg.norm(r), sizes, out=np.ones_like(sizes), where=sizes > 0.0)
-        found = scipy.optimize.least_squares(
-            lambda x: at(x)[0],
-            y,
-            lambda x: at(x)[1],
-            (lower, upper),
-            "dogbox",
-            x_scale=scale,
-            ftol=tolerance,
-            xtol=tolerance,
-            gtol=None,
-            max_nfev=evaluations,
-        )
-        self.jacobian = at(found.x)[1][: len(found.fun) - len(prior)]
-        return found.x, "converged" if found.status > 0 else "evaluations"
+
+        def at(y: Floats) -> tuple[Floats, Floats, float]:
+            r, J = evaluate(y)
+            self.done += 1
+            both = np.concatenate([r, y[prior]])
+            cost = float(both @ both)
+            if cost < self.least:
+                self.best, self.least, self.jacobian = y, cost, J
+            if self.callback is not None:
+                self.callback(self.done, float(np.sqrt(r @ r / len(r))))
+            return both, np.concatenate([J, np.eye(self.size)[prior]]), cost
+
+        self.least, damping = np.inf, _LEAST_DAMPING
+        r, J, cost = at(np.clip(y, lower, upper))
+        y = self.best
+        for _ in range(evaluations):
+            # The method of Levenberg and Marquardt within bounds; what moves nothing stays.
+            sizes = np.linalg.norm(J, axis=0)
+            weights = np.sqrt(damping) * np.where(sizes > 0.0, sizes, 1.0)
+            system = np.concatenate([J, np.diag(weights)]), -np.concatenate([r, np.zeros(self.size)])
+            step = lsq_linear(*system, (lower - y, upper - y + _OPEN), method="bvls").x
+            gain = cost - float(np.square(r + J @ step).sum())
+            if gain <= tolerance * cost:
+                return y, "converged"
+            trial = at(np.clip(y + step, lower, upper))
+            if trial[2] < cost:
+                y, (r, J, cost), damping = self.best, trial, max(0.1 * damping, _LEAST_DAMPING)
+            elif damping > _MOST_DAMPING:
+                return y, "converged"
+            else:
+                damping = max(10.0 * damping, _FIRST_DAMPING)
+        return y, "evaluations"
 
 
 def _bodies(of: Parameters) -> list[tuple[list[int], Body]]:
@@ -399,39 +401,28 @@ class _Stretch:
         return np.concatenate(rows)
 
     def residuals(
-        self, scene: Scene, varied: Sequence[Varied], late: float, x0: Floats
+        self, scene: Scene, varied: Sequence[Varied], delay: float, x0: Floats
     ) -> tuple[Floats, Floats, Floats] | None:
         """Predictions minus samples (r,), and derivatives in start (r, 2n) and in parameters and delay (r, P + 1)."""
-        u, by_delay = (part[self.begin : self.end] for part in self.run.controls(late))
+        u, by_delay = (part[self.begin : self.end] for part in self.run.controls(delay))
         motion = self.motion(scene, u, x0)
         if motion is None:
             return None
-        integrator, n, P = self.run.fit.integrator, scene.robot.dof, len(varied)
-        q, v = np.ascontiguousarray(motion.q), np.ascontiguousarray(motion.v)
+        integrator, n = self.run.fit.integrator, scene.robot.dof
         try:
             linear = linearize_steps(scene, motion, integrator, motion.q[0])
             D = integrator.in_parameters(scene, motion, varied)
         except LinearizationError:
             return None
-        more = np.concatenate([D, linear.B @ by_delay[:, :, None]], axis=2)
-        x = np.zeros((len(q), 2 * n, 2 * n + P + 1))
-        x[0, :, : 2 * n] = np.eye(2 * n)
-        if integrator.variational:
-            # The momentum of a start at given velocity.
-            M, Lvq = node_jets(scene, q[:1], v[:1])
-            x[0, n:, :n], x[0, n:, n : 2 * n] = Lvq[0], M[0]
-            x[0, n:, 2 * n : -1] = np.stack([momentum_change(each, q[:1], v[:1])[0] for each in varied], axis=1)
-        for j, A in enumerate(linear.A):
-            x[j + 1] = A @ x[j]
-            x[j + 1, :, 2 * n :] += more[j]
-        in_v = x[:, n:]
-        if integrator.variational:
-            other = velocity_at_nodes(scene, q, v)
-            in_v = other @ x
-            pull = np.stack([momentum_change(each, q, v) for each in varied], axis=2)
-            in_v[:, :, 2 * n : -1] -= other[:, :, n:] @ pull
+        by = motion_map(scene, motion, varied, (linear.A, linear.B, D), variational=integrator.variational)
+        none, late = np.zeros((len(D), 2 * n, 2 * n)), linear.B @ by_delay[:, :, None]
+        begin = np.concatenate([by.by_q0, by.by_v0, by.by_theta, np.zeros((2 * n, 1))], axis=1)
+        x = by.forward(begin, np.concatenate([none, D, late], axis=2))
+        in_v = by.in_velocities(x)[:, n:]
+        if by.variational:
+            in_v[:, :, 2 * n : -1] += by.shift
         J = self._weighed(x[:, :n], in_v)
-        return self._weighed(q, v) - self._measured, J[:, : 2 * n], J[:, 2 * n :]
+        return self._weighed(motion.q, motion.v) - self._measured, J[:, : 2 * n], J[:, 2 * n :]
 
     def fitted(self, scene: Scene, varied: Sequence[Varied], late: float) -> tuple[Floats, Floats]:
         """Residuals (r,) at the best start, and derivatives in parameters and delay (r, P + 1) as the start follows."""
