@@ -149,8 +149,10 @@ if TYPE_CHECKING:
     from varpin.ensemble import simulate_ensemble as simulate_ensemble
     from varpin.estimation import Estimate as Estimate
     from varpin.estimation import Gradient as Gradient
+    from varpin.estimation import Identification as Identification
     from varpin.estimation import Log as Log
     from varpin.estimation import Sensitivities as Sensitivities
+    from varpin.estimation import identify as identify
     from varpin.estimation import kalman_filter as kalman_filter
     from varpin.estimation import sensitivities as sensitivities
     from varpin.estimation import smooth as smooth
@@ -205,7 +207,9 @@ _LATE = {
     ),
     "varpin.control.mpc": "Mpc MpcRun Plant",
     "varpin.ensemble": ("Ensemble EnsembleInterrupted EnsembleStatistics PathFailure simulate_ensemble"),
-    "varpin.estimation": "Estimate Gradient Log Sensitivities kalman_filter sensitivities smooth",
+    "varpin.estimation": (
+        "Estimate Gradient Identification Log Sensitivities identify kalman_filter sensitivities smooth"
+    ),
     "varpin.io.scenefile": "SceneFile SceneFileError load_scene",
     "varpin.linearization": "Curvature Linearization Moments linearize propagate_moments second_order",
     "varpin.model.clearance": "Obstacle",

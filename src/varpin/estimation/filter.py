@@ -229,16 +229,17 @@ def smooth(scene: Scene, log: Log | Trajectory, *, q_noise: JointValues, **optio
 def _measured(log: Log, q_noise: JointValues, v_noise: JointValues | None) -> tuple[Floats, Floats]:
     """The samples (K, z) of a log in the robot's order, and the variances (z,) of their errors."""
     joints = log.joints or ()
-    variance = _variance("q_noise", q_noise, joints)
+    variance = variances("q_noise", q_noise, joints)
     if v_noise is None:
         return np.ascontiguousarray(log.q), variance
     if log.v is None:
         raise InputError("v_noise is given, and the log has no velocities v")
     both = np.ascontiguousarray(np.concatenate([log.q, log.v], axis=1))
-    return both, np.concatenate([variance, _variance("v_noise", v_noise, joints)])
+    return both, np.concatenate([variance, variances("v_noise", v_noise, joints)])
 
 
-def _variance(name: str, value: JointValues, joints: tuple[str, ...]) -> Floats:
+def variances(name: str, value: JointValues, joints: tuple[str, ...]) -> Floats:
+    """Squares (n,) of standard deviations: one number, (n,) or by joint name, > 0."""
     deviation = joint_array(name, value, joints, uniform=True)
     with np.errstate(over="ignore", under="ignore"):
         variance: Floats = deviation**2
@@ -251,7 +252,7 @@ def _external(given: tuple[JointValues, float], joints: tuple[str, ...], h: Floa
     """Variances (n,) of external forces, and the share (K - 1,) that steps of length h keep of them."""
     if not isinstance(given, tuple | list) or len(given) != 2:
         raise InputError(f"external must be (standard deviation [N m or N], time [s]), got {given!r}")
-    strength = _variance("external: standard deviation", given[0], joints)
+    strength = variances("external: standard deviation", given[0], joints)
     return strength, np.exp(-h / positive("external: time", given[1], "s"))
 
 

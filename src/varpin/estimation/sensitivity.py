@@ -57,7 +57,7 @@ class Sensitivities:
     q: Floats
     v: Floats
     p: Floats
-    _map: _Map
+    _map: MotionMap
 
     def __repr__(self) -> str:
         nodes, n, P = self.q.shape
@@ -92,7 +92,7 @@ class Sensitivities:
 
 
 @dataclass(frozen=True, eq=False)
-class _Map:
+class MotionMap:
     """The linear map from parameters, start and controls to nodes: x' = A x + B u + D theta."""
 
     A: Floats  # (N, 2n, 2n)
@@ -158,21 +158,22 @@ def sensitivities(
     chosen = matching_integrator(scene, motion, integrator)
     varied = of.varied()
     D = chosen.in_parameters(scene, motion, varied)
-    by = _map(scene, motion, varied, (linear.A, linear.B, D), variational=chosen.variational)
+    by = motion_map(scene, motion, varied, (linear.A, linear.B, D), variational=chosen.variational)
     x, n = by.forward(by.by_theta, D), scene.robot.dof
     other = by.other @ x + by.shift
     v, p = (other, x[:, n:]) if chosen.variational else (x[:, n:], other)
     return Sensitivities(of.names, of.values, x[:, :n], v, p, by)
 
 
-def _map(
+def motion_map(
     scene: Scene,
     motion: Trajectory,
     varied: Sequence[Varied],
     steps: tuple[Floats, Floats, Floats],
     *,
     variational: bool,
-) -> _Map:
+) -> MotionMap:
+    """The map of a motion whose steps have the derivatives A, B and D."""
     q, v = (np.ascontiguousarray(x) for x in (motion.q, motion.v))
     M, Lvq = node_jets(scene, q, v)
     pull = np.stack([momentum_change(each, q, v) for each in varied], axis=2)
@@ -181,9 +182,9 @@ def _map(
     if variational:
         other = velocity_at_nodes(scene, q, v)
         begin = (np.vstack([one, Lvq[0]]), np.vstack([zero, M[0]]), np.vstack([none, pull[0]]))
-        return _Map(*steps, *begin, other, -other[:, :, n:] @ pull, variational=True)
+        return MotionMap(*steps, *begin, other, -other[:, :, n:] @ pull, variational=True)
     begin = (np.vstack([one, zero]), np.vstack([zero, one]), np.vstack([none, none]))
-    return _Map(*steps, *begin, np.concatenate([Lvq, M], axis=2), pull, variational=False)
+    return MotionMap(*steps, *begin, np.concatenate([Lvq, M], axis=2), pull, variational=False)
 
 
 def momentum_change(varied: Varied, q: Floats, v: Floats) -> Floats:
