@@ -155,4 +155,4 @@ def _facts(found: Identification, written: Sequence[tuple[str, Path]]) -> Table:
         *(("warning", finding) for finding in found.warnings[1:]),
         *written,
     ]
-    return Table("", (), rows)
+    return Table("\nsearch", (), rows)

@@ -6,10 +6,12 @@ Equations (I1) and (I2) of docs/mathematics.md.
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,6 +29,7 @@ from varpin.integrators import Gauss, Integrator
 from varpin.integrators.base import Varied
 from varpin.linearization import linearize_steps
 from varpin.mechanics.scene import Scene, require_scene
+from varpin.model.urdf_output import save_urdf
 from varpin.signals.commands import open_loop
 from varpin.simulation.choice import given_integrator
 from varpin.simulation.record import rollout
@@ -119,6 +122,26 @@ class Identification(Frozen):
     def deviations(self) -> Floats:
         """Standard deviations of the values (P,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def save_urdf(self, path: str | os.PathLike[str]) -> Path:
+        """Write the robot's URDF file with the values; other parameters than a URDF has are told in the log.
+
+        Raises:
+            InputError: The robot comes from no URDF, or ``path`` does not end in .urdf.
+            FileError: The file cannot be written.
+        """
+        kinds: dict[str, dict[str, float]] = {"damping": {}, "friction": {}}
+        apart = []
+        for name, value in zip(self.names, self.values.tolist(), strict=True):
+            kind, _, joint = name.partition(":")
+            if kind in kinds:
+                kinds[kind][joint] = value
+            elif kind not in ("payload", "inertia"):
+                apart.append(name)
+        target = save_urdf(self.scene.robot, path, **kinds)
+        if apart:
+            logger.warning("%s: a URDF has no place for %s", target, ", ".join(apart))
+        return target
 
 
 def identify(

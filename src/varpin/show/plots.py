@@ -221,14 +221,15 @@ def plot_identification(
     robot, given = found.scene.robot, (joints,) if isinstance(joints, str) else joints
     names = robot.joint_names if given is None else tuple_of("joints", given, str)
     chosen, t, samples = [robot.coordinate(name) for name in names], found.logs[log].t, found.logs[log].q
-    figure = Figure(figsize=(9.0, 1.6 * len(chosen) + 2.5), layout="constrained")
+    figure = Figure(figsize=(9.0, 1.7 * len(chosen) + 2.5), layout="constrained")
     panels = figure.subplots(len(chosen) + 1, 1, sharex=True, height_ratios=[*[2] * len(chosen), 3])
     for c, panel, style in zip(chosen, panels, _styles(len(chosen)), strict=False):
-        panel.plot(t, samples[:, c], ".", label="measured", color="0.6", markersize=4)
+        panel.plot(t, samples[:, c], ".", label="measured", color="0.7", markersize=6)
         panel.set_ylim(panel.get_ylim())  # the motion before may be far away
-        panel.plot(t, found.predicted_before[log][:, c], label="before", color=COLORS[1], linestyle="--")
-        panel.plot(t, found.predicted[log][:, c], label="after", color=COLORS[0], linewidth=1.2)
-        panel.set_ylabel(f"{robot.joint_names[c]}\n[{joint_unit(robot, c)}]")
+        panel.plot(t, found.predicted_before[log][:, c], label="before", color="0.4", linestyle="--", linewidth=1.0)
+        panel.plot(t, found.predicted[log][:, c], label="after", color="black", linewidth=0.8)
+        panel.set_title(robot.joint_names[c], loc="left", fontsize="small")
+        panel.set_ylabel(f"q [{joint_unit(robot, c)}]")
         panels[-1].plot(t, found.residuals[log][:, c], label=robot.joint_names[c], **{**style, "linewidth": 0.8})
     panels[-1].set(xlabel="time [s]", ylabel=f"residual [{joint_unit(robot, chosen)}]", xlim=(t[0], t[-1]))
     for panel in panels:
