@@ -86,7 +86,7 @@ def complain(console: Console, error: object) -> None:
 def say(console: Console, message: str, *, prefix: str = "varpin", style: str | None = None) -> None:
     """Print a message as it is, after a prefix."""
     text = f"{prefix}: {message}" if prefix else message
-    console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+    console.print(text, style=style, markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 def show(content: object) -> None:

@@ -57,8 +57,10 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
     text = "by how much the controls act later than the logs say [s]; default: it is found, too"
     parser.add_argument("--delay", type=float, metavar="S", help=text)
     parser.add_argument("--dt", type=float, metavar="S", help="time step [s]; default: the usual one of the logs")
-    text = "length of the stretches that are simulated [s]; default: whole logs"
+    text = "length of the stretches that are simulated [s], inf for whole logs; default: 1"
     parser.add_argument("--horizon", type=float, metavar="S", help=text)
+    text = "most evaluations of each search; default: 100"
+    parser.add_argument("--evaluations", type=int, metavar="N", help=text)
     add_integrator(parser)
     begin = parser.add_argument_group("begin")
     add_gravity(begin)
@@ -74,6 +76,7 @@ def _identify(request: argparse.Namespace, errors: Console) -> int:
     scene = _scene(request)
     logs, apart = ([Log.load(path) for path in paths] for paths in (request.logs, request.held_out))
     options: dict[str, Any] = {name: getattr(request, name) for name in ("delay", "dt", "horizon")}
+    options |= {} if request.evaluations is None else {"evaluations": request.evaluations}
     options |= {name: values_of(name.replace("_", "-"), getattr(request, name)) for name in ("q_noise", "v_noise")}
     if request.integrator is not None:
         options["integrator"] = integrator_of_words(request.integrator)
