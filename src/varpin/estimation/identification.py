@@ -9,7 +9,7 @@ import logging
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -208,12 +208,12 @@ def identify(
     y[: len(of.names)] = fit.begin
     try:
         if scene.processes:
-            y, status = fit.search(lambda x: _predictions(fit, runs, x), y, _TIGHT, evaluation)
+            y, status = fit.search(partial(_predictions, fit, runs), y, _TIGHT, evaluation)
         else:
             for finer in range(fit.doublings(runs), -1, -1):
                 stretches = [part for run in runs for part in run.stretches(2**finer)]
                 tolerance = _LOOSE if finer else _TIGHT
-                y, status = fit.search(lambda x, of=stretches: _simulations(fit, of, x), y, tolerance, evaluation)
+                y, status = fit.search(partial(_simulations, fit, stretches), y, tolerance, evaluation)
     except KeyboardInterrupt:
         y, status = fit.best, "interrupted"
     return _made(fit, y, runs, [_Run(fit, log) for log in apart], status)
@@ -416,7 +416,7 @@ class _Stretch:
         return np.concatenate(rows)
 
     @cached_property
-    def _measured(self) -> Floats:
+    def measured(self) -> Floats:
         fit, log = self.run.fit, self.run.log
         rows = [(log.q[self.samples] / fit.deviation)[np.isfinite(log.q[self.samples])]]
         if fit.v_deviation is not None and log.v is not None:
@@ -445,7 +445,7 @@ class _Stretch:
         if by.variational:
             in_v[:, :, 2 * n : -1] += by.shift
         J = self._weighed(x[:, :n], in_v)
-        return self._weighed(motion.q, motion.v) - self._measured, J[:, : 2 * n], J[:, 2 * n :]
+        return self._weighed(motion.q, motion.v) - self.measured, J[:, : 2 * n], J[:, 2 * n :]
 
     def fitted(self, scene: Scene, varied: Sequence[Varied], late: float) -> tuple[Floats, Floats]:
         """Residuals (r,) at the best start, and derivatives in parameters and delay (r, P + 1) as the start follows."""
@@ -464,7 +464,7 @@ class _Stretch:
                 break
             x0, found = x0 - step, trial
         if found is None:
-            return np.full(self._measured.size, _LOST), np.zeros((self._measured.size, len(varied) + 1))
+            return np.full(self.measured.size, _LOST), np.zeros((self.measured.size, len(varied) + 1))
         r, Jx, J = found
         self.run.starts[self.begin] = x0
         along, _ = np.linalg.qr(Jx)
@@ -515,14 +515,15 @@ def _innovations(fit: _Fit, run: _Run, scene: Scene, varied: Sequence[Varied], l
         seen = kalman_filter(scene, log, q_noise=fit.q_noise, v_noise=fit.v_noise, dt=2.0 * fit.dt,
                              integrator=fit.integrator)  # fmt: skip
     except LinearizationError:
-        rows = int(np.isfinite(log.q).sum())
-        return np.full(rows, _LOST), np.zeros((rows, len(varied) + 1))
+        known = sum(part.measured.size for part in run.stretches())
+        return np.full(known, _LOST), np.zeros((known, len(varied) + 1))
     n, q, v = scene.robot.dof, seen.q, seen.v
     motion = _through(scene, fit, seen.forward.state, q, v, u)
     D = fit.integrator.in_parameters(scene, motion, varied)
     B = linearize_steps(scene, motion, fit.integrator, q[0]).B
     more = np.concatenate([D, B @ by_delay[:, :, None]], axis=2)
-    x, rows = np.zeros((2 * n, more.shape[2])), []
+    x = np.zeros((2 * n, more.shape[2]))
+    rows: list[Floats] = []
     for k, (H, gain) in enumerate(zip(seen.forward.rows, seen.gains, strict=True)):
         if k:
             x = seen.forward.transition[k - 1] @ x + more[k - 1]
