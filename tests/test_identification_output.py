@@ -1,5 +1,7 @@
 """What is made of an identification: a URDF, a figure, and what ``varpin identify`` prints."""
 
+import contextlib
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -189,6 +191,24 @@ def test_the_command_tells_what_it_could_not_find(swings, capsys):
         assert not unnamed(capsys.readouterr().err, facts)
 
 
+def test_ctrl_c_keeps_the_best_values(swings, tmp_path, capsys, monkeypatch):
+    path, (one, _) = swings
+
+    @contextlib.contextmanager
+    def pressed(*_, **__):
+        def tell(done, _):
+            if done == 4:
+                raise KeyboardInterrupt
+
+        yield tell
+
+    monkeypatch.setattr("varpin.cli.fits.progress_bar", pressed)
+    words = ["identify", path, one, "--q-noise", "1e-4", "--parameters", "damping", "--save", tmp_path / "a.urdf"]
+    assert main([*map(str, words)]) == 130
+    assert not unnamed(capsys.readouterr().err, "interrupted")
+    assert (vp.load_robot(tmp_path / "a.urdf").damping > 0.0).all()
+
+
 def test_the_command_takes_a_scene_file(tmp_path, capsys):
     file = vp.load_scene("finger_tracking")
     motion = file.simulate()
@@ -199,5 +219,5 @@ def test_the_command_takes_a_scene_file(tmp_path, capsys):
     out = capsys.readouterr().out
     for value in file.scene.damping:
         assert not unnamed(out, f"{value:.3g}")
-    assert main([*words, "--no-gravity"]) == 2
-    assert not unnamed(capsys.readouterr().err, "--no-gravity", "scene file")
+    assert main([*words, "--friction", "robot"]) == 2
+    assert not unnamed(capsys.readouterr().err, "--friction", "scene file")

@@ -29,7 +29,7 @@ def add_robot(parser: argparse.ArgumentParser, *, scenes: bool = False) -> None:
 # Options that a scene file takes the place of.
 _OF_SCENES = (
     *("lock", "package_dir", "dt", "tolerance", "duration", "steps", "integrator", "q", "v"),
-    *("q0", "v0", "gravity", "damping", "stiffness", "rest", "torque"),
+    *("q0", "v0", "gravity", "damping", "friction", "stiffness", "rest", "torque"),
 )
 
 
@@ -69,15 +69,17 @@ def add_vector(group: argparse._ActionsContainer, name: str, text: str) -> None:
     group.add_argument(f"--{name}", nargs="+", metavar="X", help=text)
 
 
-def add_integrator(parser: argparse.ArgumentParser) -> None:
+# The integrator of a motion for which none is named.
+_CHOSEN = (
+    "Gauss(stages=2), with 4 where springs are fast for the step, Radau(stages=4) where dampers are faster, "
+    "Midpoint(kick=held) under noise"
+)
+
+
+def add_integrator(parser: argparse.ArgumentParser, default: str = _CHOSEN) -> None:
     """Add the choice of the integrator."""
-    parser.add_argument(
-        "--integrator",
-        metavar="NAME",
-        help=f"{', '.join(BY_NAME)}; with options as Python writes them, 'Gauss(stages=3)'; default: Gauss(stages=2), "
-        "with 4 where springs are fast for the step, Radau(stages=4) where dampers are faster, "
-        "Midpoint(kick=held) under noise",
-    )
+    text = f"{', '.join(BY_NAME)}; with options as Python writes them, 'Gauss(stages=3)'; default: {default}"
+    parser.add_argument("--integrator", metavar="NAME", help=text)
 
 
 def integrator_of_words(text: str) -> Integrator:

@@ -61,7 +61,7 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--horizon", type=float, metavar="S", help=text)
     text = "most evaluations of each search; default: 100"
     parser.add_argument("--evaluations", type=int, metavar="N", help=text)
-    add_integrator(parser)
+    add_integrator(parser, default="Gauss(stages=2)")
     begin = parser.add_argument_group("begin")
     add_gravity(begin)
     for name, text in (("damping", "viscous damping [N m s/rad or N s/m]"), ("friction", "dry friction [N m or N]")):
