@@ -14,7 +14,6 @@ from scipy.optimize import fsolve
 
 import varpin as vp
 from varpin.model.chain import rod_chain
-from varpin.simulation.loop import unstable_loop
 
 KIND = "unstable loop"
 
@@ -70,7 +69,7 @@ def test_jury_conditions(kp, kd, period):
     options = {"dt": h / period, "steps": 150 * period, "period": period}
     motion = run(ROD, [0.3], [0.2 * (kp == 0)], pd(kp, kd), **options)
     assert bool(told(motion)) != stable, (size, motion.warnings)
-    for finding in unstable_loop(ROD, motion):
+    for finding in told(motion):
         assert (finding.kind, finding.joint) == (KIND, "joint1")
         np.testing.assert_allclose(finding.value, size, rtol=1e-6)
         assert naming([finding], f"{size:.4g}", "0.01 s")
@@ -136,7 +135,7 @@ def test_an_unstable_loop_that_clips_is_told(n, period, kp, kd, limit, gravity):
 
 def test_the_count_of_turns():
     motion = run(ROD, [0.0], [0.5], lambda t, q, v: -5.0 * np.sign(v), dt=1e-2, steps=300)
-    (finding,) = unstable_loop(ROD, motion)
+    (finding,) = told(motion)
     assert finding.value > 290
     assert 0.0 < finding.time < 0.3
     assert naming([finding], "joint1", f"{finding.value:.0f} times", "300 periods", "0.01 s")
