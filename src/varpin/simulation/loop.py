@@ -28,12 +28,13 @@ from varpin.mechanics.assembly import nearest
 from varpin.mechanics.scene import Scene
 from varpin.signals.functions import ControlLaw, Copies, copier, decision
 from varpin.simulation.spectrum import masses
+from varpin.support.one_thread import one_thread
 from varpin.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
 
 # Most states of a motion, and most turns, at which the law is differentiated.
-_NODES = 8
+_NODES = 5
 # Displacement of a coordinate [rad or m, and by s]: above the rounding of laws in single precision.
 _SMALL = 1e-4
 # Least share of second differences in first ones of a law that jumps or has a kink within the displacement.
@@ -44,6 +45,8 @@ _MEMORY = 6
 _SAME = 1e-9
 # Iterations of Newton's method, and its last step [rad or m].
 _ITERATIONS, _CONVERGED = 30, 1e-8
+# Stiffness, as a share of the largest, below which a direction is free to stay anywhere.
+_SINGULAR = 1e-6
 # Rank tolerance of the constraints in the metric of the kinetic energy, relative to the largest singular value.
 _RANK = 1e-9
 # Least growth a period: rounding of differences may split double eigenvalues by 3e-6. 0 to 1e-5: the same.
@@ -123,15 +126,12 @@ def unstable_loop(
         return ()
     worst, turning = _turning(u)
     groups = [_spread(nodes) for nodes in (_inside(u), turning)]
-    loops: dict[int, Loop] = {}
-    # Commands of kinematic inputs are positions.
-    if law is not None and not scene.inputs:
-        with np.errstate(all="ignore"):
-            loops = _loops(scene, law, t, x, u, sorted(set().union(*groups)))
-    for nodes in groups:
-        found = _by_theory(scene, [loops[k] for k in nodes if k in loops], period)
-        if found:
-            return found
+    with np.errstate(all="ignore"), one_thread():
+        loops = _loops(scene, law, t, x, u, sorted(set().union(*groups)))
+        for nodes in groups:
+            found = _by_theory(scene, [loops[k] for k in nodes if k in loops], period)
+            if found:
+                return found
     if trajectory.dw.any() or any(k in loops and loops[k].H[:, worst].any() for k in groups[-1]):
         return ()
     return _by_turns(scene, x, u, t, worst, turning)
@@ -166,8 +166,13 @@ def _turning(u: Floats) -> tuple[int, Integers]:
     return worst, 1 + np.flatnonzero(turns[:, worst] & (most[worst] >= _TURNS))
 
 
-def _loops(scene: Scene, law: Copies | Gains, t: Floats, x: Floats, u: Floats, nodes: Sequence[int]) -> dict[int, Loop]:
+def _loops(
+    scene: Scene, law: Copies | Gains | None, t: Floats, x: Floats, u: Floats, nodes: Sequence[int]
+) -> dict[int, Loop]:
     """The loops with a law at some nodes of times t (P,), states x (P, 2n) and controls u (P, m), where it responds."""
+    # Commands of kinematic inputs are positions.
+    if law is None or scene.inputs:
+        return {}
     middle, n = _centres(x), x.shape[1] // 2
     centres = {k: middle[k - 1] for k in nodes}
     given: Iterable[tuple[int, Floats, Floats]]
@@ -178,9 +183,11 @@ def _loops(scene: Scene, law: Copies | Gains, t: Floats, x: Floats, u: Floats, n
     found = {}
     try:
         for k, control, H in given:
-            if H.any() and np.isfinite(H).all():
-                found[k] = _at_equilibrium(scene, x[0, :n], centres[k], control, H)
-    except (ControlError, LinearizationError, np.linalg.LinAlgError) as error:
+            known = H.any() and np.isfinite(H).all()
+            loop = _at_equilibrium(scene, x[0, :n], centres[k], control, H) if known else None
+            if loop is not None:
+                found[k] = loop
+    except (AssemblyError, SingularMassMatrix, ControlError, LinearizationError, np.linalg.LinAlgError) as error:
         logger.debug("a control law is differentiated at %d of %d states: %r", len(found), len(nodes), error)
     return found
 
@@ -203,7 +210,8 @@ def _responses(
     """
 
     def call(own: ControlLaw, k: int, state: Floats, later: int = 0) -> Floats:
-        return decision(own, scene, k, float(t[k] + later * t[1]), *np.split(state, 2))[0]
+        control: Floats = decision(own, scene, k, float(t[k] + later * t[1]), *np.split(state, 2))[0]
+        return control
 
     def gives(own: ControlLaw, k: int) -> bool:
         return bool(np.allclose(call(own, k, x[k]), u[k], rtol=_SAME, atol=_SAME * np.abs(u[k]).max()))
@@ -280,46 +288,36 @@ def _by_turns(scene: Scene, x: Floats, u: Floats, t: Floats, control: int, turns
     return _finding(scene, control, text, float(len(turns)), float(t[turns[0]]))
 
 
-def _at_equilibrium(scene: Scene, start: Floats, centre: Floats, u: Floats, H: Floats) -> Loop:
-    """The loop at the equilibrium that Newton's method finds from ``start`` (n,), or at the state ``centre`` (2n,).
+def _at_equilibrium(scene: Scene, start: Floats, centre: Floats, u: Floats, H: Floats) -> Loop | None:
+    """The loop at the equilibrium that Newton's method finds from ``start`` (n,), None if it finds none.
 
-    The law has the control u (m,) at ``centre`` and the responses H (J, m, 2n) everywhere.
+    The law has the control u (m,) at the state ``centre`` (2n,) and the responses H (J, m, 2n) everywhere.
     """
-    n, q = len(start), start
+    q, K = start, H.sum(axis=0)
     for _ in range(_ITERATIONS):
-        try:
-            q = nearest(scene, q) if scene.constraints else q
-        except (AssemblyError, SingularMassMatrix):
-            break
-        loop, way = _linearized(scene, q, u - H.sum(axis=0) @ (centre - np.append(q, np.zeros(n))), H)
+        q = nearest(scene, q) if scene.constraints else q
+        a, aq, av, af, Z = _at_rest(scene, q, scene.actuation @ (u + K @ (np.append(q, np.zeros_like(q)) - centre)))
+        pushed, responses = af @ scene.actuation, H @ np.kron(np.eye(2), Z)
+        way = Z @ np.linalg.lstsq(aq + pushed @ (K[:, : len(q)] @ Z), -a, rcond=_SINGULAR)[0]
         if np.abs(way).max() < _CONVERGED:
-            return loop
+            A = np.block([[np.zeros_like(aq), np.eye(len(aq))], [aq, av]])
+            kept = float(np.vdot(H[-1], H[-2]) / np.vdot(H[-2], H[-2])) if len(H) == _MEMORY else 0.0
+            return Loop(A, np.concatenate([np.zeros_like(pushed), pushed]), responses, min(max(kept, 0.0), 1.0))
         q = q + way / max(1.0, np.abs(way).max())
-    return _linearized(scene, centre[:n], u, H)[0]
+    return None
 
 
-def _linearized(scene: Scene, q: Floats, u: Floats, H: Floats) -> tuple[Loop, Floats]:
-    """The loop at rest at q (n,) under the controls u (m,), and Newton's step to the equilibrium (n,)."""
-    a, aq, av, af, Z, onto = _at_rest(scene, q, scene.actuation @ u)
-    pushed, responses = af @ scene.actuation, H @ np.kron(np.eye(2), Z)
-    A = np.block([[np.zeros_like(aq), np.eye(len(aq))], [aq, av]])
-    B = np.concatenate([np.zeros_like(pushed), pushed])
-    kept = float(np.clip(np.vdot(H[-1], H[-2]) / np.vdot(H[-2], H[-2]), 0.0, 1.0)) if len(H) == _MEMORY else 0.0
-    way: Floats = Z @ np.linalg.lstsq(aq + pushed @ responses.sum(axis=0)[:, : len(a)], -a, rcond=None)[0]
-    return Loop(A, B, responses, kept), way
-
-
-def _at_rest(scene: Scene, q: Floats, force: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+def _at_rest(scene: Scene, q: Floats, force: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """The motion linearized at rest at q (n,) under a constant force (n,), in f coordinates y of its tangent space.
 
-    Accelerations of y (f,), their derivatives in y (f, f), in its rate (f, f) and in a force (f, n), and dq = Z dy,
-    dy' = onto dv, with Z'MZ = 1 and C Z = 0. The constraint forces C' lam are constant to first order in y, but for
+    Accelerations of y (f,), their derivatives in y (f, f), in its rate (f, f) and in a force (f, n), and dq = Z dy
+    with Z'MZ = 1 and C Z = 0. The constraint forces C' lam are constant to first order in y, but for
     their curvature lam . g_qq.
     """
     still = np.zeros((1, len(q)))
     a, aq, av, af = (part[0] for part in accelerations(scene, q[None], still, force[None]))
     if not scene.constraints:
-        return a, aq, av, af, np.eye(len(q)), np.eye(len(q))
+        return a, aq, av, af, np.eye(len(q))
     C = scene.core.constraints(np.ascontiguousarray(q[None]))[2][0]
     root = np.linalg.cholesky(af)
     left, sizes, right = np.linalg.svd(C @ root)
@@ -329,4 +327,4 @@ def _at_rest(scene: Scene, q: Floats, force: Floats) -> tuple[Floats, Floats, Fl
     a, aq, av, af = (part[0] for part in accelerations(scene, q[None], still, (force + C.T @ lam)[None]))
     onto = Z.T @ np.linalg.inv(af)
     curved = scene.core.constraint_curvature(q, lam, q)[0]
-    return onto @ a, onto @ (aq + af @ curved) @ Z, onto @ av @ Z, onto @ af, Z, onto
+    return onto @ a, onto @ (aq + af @ curved) @ Z, onto @ av @ Z, onto @ af, Z
