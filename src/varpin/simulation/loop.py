@@ -1,19 +1,17 @@
 """The stability of a digital control loop at its period, from a finished motion and copies of its control law.
 
-At some states of the motion the law is differentiated by calls of copies, whose noise is the same and cancels.
-With a memory it is u_k = sum_i H_i x_(k-i), x = (q, v); H_i is what a displacement of x changes i periods later. With
-the plant's exact step under a zero-order hold at rest, x' = A x + B u, the loop is unstable if the spectral radius of
-the step of (x_k, x_(k-1), ...) exceeds one (Franklin, Powell and Workman 1998, section 4.3). Growth that the law would
-have in continuous time too, as in a falling pendulum, gives no warning.
+At some states of the motion the law is differentiated, :mod:`varpin.signals.responses`. With the plant's exact step
+under a zero-order hold at the law's equilibrium, x' = A x + B u, the loop is unstable if the spectral radius of the
+step of (x_k, x_(k-1), ...) exceeds one (Franklin, Powell and Workman 1998, section 4.3). Growth that the law would have
+in continuous time too, as in a falling pendulum, gives no warning.
 
 A law that does not respond to small displacements, as at its limits, shows by turning back every few periods.
 """
 
 from __future__ import annotations
 
-import functools
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,7 +24,8 @@ from varpin.finding import Finding
 from varpin.integrators.explicit import accelerations
 from varpin.mechanics.assembly import nearest
 from varpin.mechanics.scene import Scene
-from varpin.signals.functions import ControlLaw, Copies, copier, decision
+from varpin.signals.functions import Copies
+from varpin.signals.responses import MEMORY, responses
 from varpin.simulation.spectrum import masses
 from varpin.support.one_thread import one_thread
 from varpin.trajectory import Trajectory
@@ -35,14 +34,6 @@ logger = logging.getLogger(__name__)
 
 # Most states of a motion, and most turns, at which the law is differentiated.
 _NODES = 5
-# Displacement of a coordinate [rad or m, and by s]: above the rounding of laws in single precision.
-_SMALL = 1e-4
-# Least share of second differences in first ones of a law that jumps or has a kink within the displacement.
-_KINK = 0.1
-# Periods in which the response to a displacement is seen; beyond, it decays at one rate, as of filters and integrals.
-_MEMORY = 6
-# Largest relative error of a call that gives the recorded control: other sums in the same arithmetic.
-_SAME = 1e-9
 # Iterations of Newton's method, and its last step [rad or m].
 _ITERATIONS, _CONVERGED = 30, 1e-8
 # Stiffness, as a share of the largest, below which a direction is free to stay anywhere.
@@ -118,7 +109,8 @@ def unstable_loop(
 ) -> tuple[Finding, ...]:
     """The warning of a loop that is unstable at its period of ``hold`` steps; empty if stable, or nothing is known.
 
-    ``law`` makes copies of the law as it was before the motion; None if there are none.
+    ``law`` makes copies of the law as it was before the motion, or has its gains; None if there are neither. It is told
+    of if the loop is unstable at most of some states spread over the motion, or over the turns of a control.
     """
     period, at = hold * trajectory.dt, np.arange(0, trajectory.steps, hold)
     t, u, x = trajectory.t[at], trajectory.u[at], np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1)
@@ -179,7 +171,7 @@ def _loops(
     if isinstance(law, Gains):
         given = ((k, u[k], _of_gains(scene, law, k, centres[k])) for k in nodes)
     else:
-        given = _responses(scene, law, t, x, u, centres)
+        given = responses(scene, law, t, x, u, centres)
     found = {}
     try:
         for k, control, H in given:
@@ -198,55 +190,7 @@ def _of_gains(scene: Scene, gains: Gains, k: int, state: Floats) -> Floats:
     K, G = np.split(gains.rows[k], [2 * n], axis=1)
     if gains.momentum:
         K = np.concatenate([K[:, :n], K[:, n:] @ masses(scene, state[None, :n])[0]], axis=1)
-    return np.array([np.linalg.matrix_power(G, i) @ K for i in range(_MEMORY)]) if G.size else K[None]
-
-
-def _responses(
-    scene: Scene, law: Copies, t: Floats, x: Floats, u: Floats, centres: dict[int, Floats]
-) -> Iterator[tuple[int, Floats, Floats]]:
-    """The controls (m,) of a law at centres of nodes, and its responses (J, m, 2n).
-
-    A law that gives recorded controls again at once has no memory; any other is called in order up to each node.
-    """
-
-    def call(own: ControlLaw, k: int, state: Floats, later: int = 0) -> Floats:
-        control: Floats = decision(own, scene, k, float(t[k] + later * t[1]), *np.split(state, 2))[0]
-        return control
-
-    def gives(own: ControlLaw, k: int) -> bool:
-        return bool(np.allclose(call(own, k, x[k]), u[k], rtol=_SAME, atol=_SAME * np.abs(u[k]).max()))
-
-    def alone(own: ControlLaw, k: int, state: Floats) -> list[Floats]:
-        return [call(own, k, state)]
-
-    def rolled(copies: Copies, k: int, state: Floats) -> list[Floats]:
-        own = copies()
-        return [call(own, k, centres[k] if later else state, later) for later in range(_MEMORY)]
-
-    own, done, remembers = law(), 0, False
-    for k, centre in centres.items():
-        if not remembers:
-            remembers = not gives(own, k)
-            slopes = _slopes(functools.partial(alone, own, k), centre)
-            remembers = remembers or not gives(own, k)
-            own = law() if remembers else own
-        if remembers:
-            copies = copier(own) if all(gives(own, j) for j in range(done, k)) else None
-            if copies is None:
-                return
-            done, slopes = k, _slopes(functools.partial(rolled, copies, k), centre)
-        yield k, *slopes
-
-
-def _slopes(roll: Callable[[Floats], list[Floats]], centre: Floats) -> tuple[Floats, Floats]:
-    """The control (m,) at a state (2n,) and the response (J, m, 2n) over J periods that ``roll`` gives; 0 at a kink."""
-    moved = _SMALL * np.eye(len(centre))
-    up, down = (np.array([roll(centre + side * each) for each in moved]) for side in (1.0, -1.0))
-    first, here = up - down, np.array(roll(centre))
-    H: Floats = np.moveaxis(first, 0, -1) / (2.0 * _SMALL)
-    if np.abs(up + down - 2.0 * here).max() > _KINK * np.abs(first).max():
-        H = np.zeros_like(H)
-    return here[0], H[: 1 + max(np.flatnonzero(H.any(axis=(1, 2))), default=0)]
+    return np.array([np.linalg.matrix_power(G, i) @ K for i in range(MEMORY)]) if G.size else K[None]
 
 
 def _finding(scene: Scene, control: int, text: str, value: float, time: float | None = None) -> tuple[Finding, ...]:
@@ -301,7 +245,7 @@ def _at_equilibrium(scene: Scene, start: Floats, centre: Floats, u: Floats, H: F
         way = Z @ np.linalg.lstsq(aq + pushed @ (K[:, : len(q)] @ Z), -a, rcond=_SINGULAR)[0]
         if np.abs(way).max() < _CONVERGED:
             A = np.block([[np.zeros_like(aq), np.eye(len(aq))], [aq, av]])
-            kept = float(np.vdot(H[-1], H[-2]) / np.vdot(H[-2], H[-2])) if len(H) == _MEMORY else 0.0
+            kept = float(np.vdot(H[-1], H[-2]) / np.vdot(H[-2], H[-2])) if len(H) == MEMORY else 0.0
             return Loop(A, np.concatenate([np.zeros_like(pushed), pushed]), responses, min(max(kept, 0.0), 1.0))
         q = q + way / max(1.0, np.abs(way).max())
     return None
