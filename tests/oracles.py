@@ -257,6 +257,25 @@ class Mechanism:
         return 0.5 * float(v @ self.mass_matrix(q) @ v) + weight + self.forces(q, v, np.zeros(self.n))[0]
 
 
+def assert_jet(scene: vp.Scene, q: np.ndarray, v: np.ndarray, backend: str) -> None:
+    """The Lagrangian and its derivatives against Pinocchio's energies, along a direction by differences."""
+    own, dq = Mechanism(scene), np.random.default_rng(4).uniform(-1.0, 1.0, q.size)
+    jet, M = vp.lagrangian_jet(scene, q, v, backend=backend), own.mass_matrix(q)
+
+    def L(q: np.ndarray) -> float:
+        return v @ own.mass_matrix(q) @ v - own.energy(q, v)
+
+    size = np.abs(jet.Lq).max() + np.abs(jet.Lqq).max() + abs(jet.L)
+    assert abs(jet.L - L(q)) < 1e-12 * size
+    np.testing.assert_allclose(jet.Lvv, M, rtol=0, atol=1e-12 * np.abs(M).max())
+    np.testing.assert_allclose(jet.Lv, M @ v, rtol=0, atol=1e-12 * np.abs(jet.Lv).max())
+    assert abs(jet.Lq @ dq - slope(L, q, dq, 0.02)) < 1e-10 * size
+    in_q = slope(lambda x: vp.lagrangian_jet(scene, x, v, backend=backend).Lq, q, dq, 0.02)
+    np.testing.assert_allclose(jet.Lqq @ dq, in_q, rtol=0, atol=1e-9 * size)
+    in_q = slope(lambda x: own.mass_matrix(x) @ v, q, dq, 0.02)
+    np.testing.assert_allclose(jet.Lvq @ dq, in_q, rtol=0, atol=1e-9 * size)
+
+
 def normals(own: vp.Constraint) -> np.ndarray:
     """Directions (k, 3) along which two points of a constraint coincide."""
     if isinstance(own, vp.PointOnPoint):

@@ -1,15 +1,14 @@
-"""The Lagrangian against a plain one and Pinocchio, and steps of large trees, solved from the leaves to the roots."""
+"""The Lagrangian against Pinocchio, and steps of large trees, solved from the leaves to the roots."""
 
 from __future__ import annotations
 
-import naive
 import numpy as np
 import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mechanisms import random_tree
-from oracles import slope
+from oracles import assert_jet, slope
 
 import varpin as vp
 
@@ -27,31 +26,6 @@ def assert_close(actual: np.ndarray, expected: np.ndarray, rtol: float, what: st
     """Agreement to ``rtol`` of the largest entry, or of ``scale`` where everything might vanish."""
     scale = max(scale, np.abs(expected).max())
     np.testing.assert_allclose(actual, expected, rtol=0, atol=rtol * scale, err_msg=what)
-
-
-def naive_first(scene: vp.Scene, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """L_q and L_v at q, v (..., n) by complex step."""
-    n = scene.robot.dof
-    x = np.concatenate(np.broadcast_arrays(q, v), axis=-1)
-    g = naive.gradient(lambda y: naive.lagrangian(scene, y[..., :n], y[..., n:]), x)
-    return g[..., :n], g[..., n:]
-
-
-def check_against_naive(scene: vp.Scene, q: np.ndarray, v: np.ndarray, directions: np.ndarray, backend: str) -> None:
-    jet = vp.lagrangian_jet(scene, q, v, backend=backend)
-    kinetic = 0.5 * v @ jet.Lvv @ v
-    L = naive.lagrangian(scene, q, v)
-    assert abs(jet.L - L) <= 1e-13 * (abs(kinetic) + abs(kinetic - L)) * scene.robot.dof
-    Lq, Lv = naive_first(scene, q, v)
-    assert_close(jet.Lq, Lq, 1e-12, "Lq")
-    assert_close(jet.Lv, Lv, 1e-12, "Lv")
-    in_q = naive.directional(lambda x: np.stack(naive_first(scene, x, v), axis=1), q, directions)
-    in_v = naive.directional(lambda x: naive_first(scene, q, x)[1], v, directions)
-    # Two single joints side by side have no L_vq at all; differences then leave rounding of L_v.
-    momentum = np.abs(Lv).max()
-    assert_close(directions @ jet.Lqq, in_q[:, 0], 2e-11, "Lqq", momentum)
-    assert_close(directions @ jet.Lvq.T, in_q[:, 1], 2e-11, "Lvq", momentum)
-    assert_close(directions @ jet.Lvv, in_v, 2e-11, "Lvv")
 
 
 def test_compiled_is_what_pinocchio_computes(robot):
@@ -72,7 +46,7 @@ def test_random_trees(backend, seed, bodies, branching):
     robot = vp.load_robot(random_tree(seed, bodies, branching=branching))
     rng = np.random.default_rng(seed)
     q, v = rng.uniform(-3.0, 3.0, bodies), rng.normal(0.0, 2.0, bodies)
-    check_against_naive(busy_scene(robot, rng), q, v, np.eye(bodies), backend)
+    assert_jet(busy_scene(robot, rng), q, v, backend)
 
 
 @pytest.mark.parametrize("name", ["ur5", "xarm7", "allegro_left_hand"])
