@@ -1,4 +1,4 @@
-"""Collocation, the midpoint rule among it: tableaux, closed forms, and what guards and Newton's method promise."""
+"""Collocation, the midpoint rule among it: closed forms, and what guards and Newton's method promise."""
 
 import math
 from dataclasses import replace
@@ -12,28 +12,10 @@ from refusals import refused
 from scipy.interpolate import pade
 
 import varpin as vp
-from varpin.integrators.tableau import gauss_coefficients, radau_coefficients
 from varpin.model.example_robot_data import FIXED_BASE
 
 GRAVITY = 9.81
 ALL = [1, 2, 3, 4, 5, 6]
-
-
-@pytest.mark.parametrize("kind", ["gauss", "radau"])
-@pytest.mark.parametrize("stages", ALL)
-def test_tableau(kind, stages):
-    """Quadrature of order 2s, collocation of order s, b_i a_ij + b_j a_ji = b_i b_j; or order 2s - 1 and c_s = 1."""
-    a, b, c = gauss_coefficients(stages) if kind == "gauss" else radau_coefficients(stages)
-    for k in range(1, 2 * stages + (kind == "gauss")):
-        assert b @ c ** (k - 1) == pytest.approx(1 / k, rel=1e-14)
-    for k in range(1, stages + 1):
-        np.testing.assert_allclose(a @ c ** (k - 1), c**k / k, rtol=0, atol=1e-14 if kind == "radau" else 1e-15)
-    if kind == "radau":
-        assert c[-1] == 1.0
-        np.testing.assert_array_equal(b, a[-1])
-    else:
-        weighted = b[:, None] * a
-        np.testing.assert_allclose(weighted + weighted.T, np.outer(b, b), rtol=0, atol=1e-16)
 
 
 def oscillator(stiffness):

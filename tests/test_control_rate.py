@@ -75,21 +75,6 @@ def test_policies_feed_the_control_before_back(monkeypatch, integrator, limits, 
         last = motion.u[2 * k]
 
 
-@pytest.mark.parametrize("limits", [None, (-0.8, 0.8)], ids=["free", "limited"])
-@pytest.mark.parametrize("before", [None, BEFORE], ids=["free", "given"])
-def test_ensembles_feed_the_control_before_of_each_path_back(before, limits):
-    scene = vp.Scene(sliders(2), gravity=False, damping=0.3, noise=vp.AdditiveNoise(0.4))
-    policy = random_policy(scene, 20, before=before, limits=limits)
-    options = {"dt": 0.05, "steps": 20, "controls": policy}
-    paths = vp.simulate_ensemble(scene, [0.3, -0.4], [0.5, 0.1], paths=45, rng=3, **options)
-    assert np.ptp(paths.u, axis=0).max(axis=0).min() > 0.1
-    for path, child in enumerate(np.random.default_rng(3).spawn(45)):
-        if path % 11 == 0:
-            alone = vp.simulate(scene, [0.3, -0.4], [0.5, 0.1], rng=child, **options)
-            assert alone.u.tobytes() == paths.u[path].tobytes()
-            assert alone.q.tobytes() == paths.q[path].tobytes()
-
-
 def test_feedback_on_another_start_and_another_control_before():
     """On a linear system the law is the optimum wherever it starts: shifted, with what acted before."""
     problem = linear(vp.ControlRateCost(MATRIX), sampling="start", hold=2)

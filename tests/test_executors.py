@@ -15,7 +15,7 @@ import pinocchio as pin
 import pytest
 from findings import about
 from refusals import refused
-from test_ensemble import make_scene, run, same_ensembles, same_paths
+from test_ensemble import make_scene, run, same_ensembles
 
 import varpin as vp
 from varpin.support.executors import executing, in_order
@@ -223,16 +223,3 @@ def test_what_work_raises_comes_back(spawned):
         next(results)
     # The pool is as good as before.
     assert list(in_order(spawned, abs, [-1, 2])) == [1, 2]
-
-
-def test_interruption_on_processes_keeps_what_is_done(spawned):
-    def interrupt(done, paths):
-        if done > 200:
-            raise KeyboardInterrupt
-
-    with pytest.raises(vp.EnsembleInterrupted) as caught:
-        run(paths=3000, executor=spawned, progress=interrupt)
-    part = caught.value.ensemble
-    assert 200 < len(part.q) < 3000
-    same_paths(part, run(paths=len(part.q)))
-    assert run(executor=spawned).statistics.count[0] == 40

@@ -206,18 +206,6 @@ def test_a_field_cannot_reach_into_the_motion():
     assert motions[0].u.tobytes() == motions[1].u.tobytes()
 
 
-@pytest.mark.parametrize("kick", ["left", "split"])
-def test_python_and_compiled_fields_give_the_same_motion(kick):
-    added, state = vp.AdditiveNoise(0.2), vp.StateNoise(0.7, center=[0.5, 0.0])
-    own = vp.CustomNoise(lambda q, v, u: np.diag(0.7 * (q - [0.5, 0.0]) ** 2), 2)
-    options = {"dt": 0.01, "steps": 200, "rng": 1, "integrator": vp.Midpoint(kick=kick)}
-    scenes = [chain(added + part) for part in (state, own)]
-    one, other = (vp.simulate(scene, [0.3, 0.2], [0, 1], **options) for scene in scenes)
-    assert other.dw.tobytes() == one.dw.tobytes()
-    for name in ("q", "v", "p", "energy"):
-        np.testing.assert_allclose(getattr(other, name), getattr(one, name), rtol=0, atol=1e-10)
-
-
 @pytest.mark.parametrize(
     "integrator", [vp.Midpoint(), vp.Midpoint(kick="split"), vp.Midpoint(kick="held"), vp.Radau(2)]
 )

@@ -18,30 +18,6 @@ from varpin.control.checks import foreseen
 from varpin.model.kinematics import frame_kinematics
 
 
-def test_slopes_of_rows_are_differences():
-    robot, rng = vp.load_robot("ur5"), np.random.default_rng(1)
-    turn = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0]
-    rules = [
-        vp.ReachFrame(robot, "tool0", [0.4, 0.1, 0.3], turn * np.linalg.det(turn)),
-        vp.WithinJointLimits(robot, (-1.0, 1.0)),
-        vp.WithinVelocityLimits(robot, (-1.0, 1.0)),
-        vp.KeepInHalfSpace(robot, "tool0", [0.2, 0.3, 1.0], 0.1),
-        vp.KeepInBox(robot, "tool0", -1.0, 1.0),
-        vp.KeepInSphere(robot, "tool0", [0.1, 0.2, 0.3], 1.0),
-        vp.KeepOutOfSphere(robot, "tool0", lambda t: [0.1 + t, 0.2, 0.3], 0.1),
-    ]
-    given = {"q0": np.zeros(6), "v0": np.zeros(6), "dt": 0.01, "steps": 3, "constraints": rules}
-    problem, u = vp.OptimalControlProblem(vp.Scene(robot), vp.ControlCost(1.0), **given), np.zeros((3, 6))
-    x = rng.normal(size=(4, 12))
-    for bound in problem.bound_constraints:
-
-        def value(x, bound=bound):
-            return bound.value(x[:, :6], x[:, 6:], u)
-
-        found = np.stack([(value(x + e) - value(x - e)) / 2e-6 for e in 1e-6 * np.eye(12)], axis=2)
-        np.testing.assert_allclose(bound.jacobian(x[:, :6], x[:, 6:]), found, atol=1e-8)
-
-
 def test_unknown_frames():
     with refused(vp.UnknownFrame, "'hand'"):
         vp.KeepInBox(TWO, "hand", 0, 1)

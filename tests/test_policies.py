@@ -44,15 +44,6 @@ def test_a_policy_with_a_period_is_held_over_finer_steps(finer):
     assert_allclose(run(motion.u, dt, INTERVALS * finer).q, motion.q, rtol=0.0, atol=1e-13)
 
 
-def test_ensembles_hold_it_alike():
-    motion = run(policy(), PERIOD / 4, 4 * INTERVALS)
-    paths = vp.simulate_ensemble(
-        SCENE, [Q0, Q0], REST, dt=PERIOD / 4, steps=4 * INTERVALS, paths=2, rng=0, controls=policy(),
-        integrator=vp.RungeKutta4(),
-    )  # fmt: skip
-    assert_array_equal(paths.u[1], motion.u)
-
-
 def test_a_plan_runs_at_finer_steps_as_it_is():
     cost = vp.VelocityCost(0.1) + vp.ControlCost(0.1) + vp.Terminal(vp.TrackingCost([0.5, 0.2], 10.0))
     problem = vp.OptimalControlProblem(SCENE, cost, Q0, REST, dt=0.01, steps=20, hold=2)

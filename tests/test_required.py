@@ -252,27 +252,3 @@ def test_nothing_is_left_out_of_scenes_with_constraints_or_functions():
         assert not vp.Scene(robot, gravity=False, **more).required(0.0, {"joint_1.0": 0.1}).idle
     with refused(vp.InputError, ("controls", "(16,)", "(1, 3)")):
         vp.Scene(robot).required(0.0, controls=np.zeros(3))
-
-
-def test_locked_joints_are_no_bodies():
-    """A Panda that moves two joints is a two-body arm, whose inertias add up from the links that are carried."""
-    lock = {f"panda_joint{k}": 0.3 for k in (1, 3, 5, 6, 7)} | {"panda_finger_joint1": 0.02}
-    robot, twin = vp.load_robot("panda", lock=lock), vp.load_robot(two_joint_panda(lock))
-    assert robot.dof == robot.tree.parent.size == 2
-    motions = [vp.simulate(vp.Scene(arm), [0.2, -1.0], [0.5, 0.0], dt=5e-3, steps=100) for arm in (robot, twin)]
-    np.testing.assert_allclose(motions[0].q, motions[1].q, rtol=0, atol=1e-11)
-
-
-def two_joint_panda(lock):
-    model = vp.load_robot("panda").free_model
-    data, q = model.createData(), pin.neutral(model)
-    for name, value in (lock | {"panda_finger_joint2": 0.02}).items():
-        q[model.joints[model.getJointId(name)].idx_q] = value
-    pin.forwardKinematics(model, data, q)
-    arm, shoulder, elbow = pin.Model(), model.getJointId("panda_joint2"), model.getJointId("panda_joint4")
-    own = {shoulder: arm.addJoint(0, pin.JointModelRZ(), data.oMi[shoulder], "shoulder")}
-    own[elbow] = arm.addJoint(own[shoulder], pin.JointModelRZ(), data.oMi[shoulder].actInv(data.oMi[elbow]), "elbow")
-    for joint in range(shoulder, model.njoints):
-        carrier = elbow if joint >= elbow else shoulder
-        arm.appendBodyToJoint(own[carrier], model.inertias[joint], data.oMi[carrier].actInv(data.oMi[joint]))
-    return arm

@@ -322,13 +322,6 @@ def test_axes_of_fixed_joints_are_not_read(tmp_path, axis):
     assert [inertial.link for inertial in robot.inertials] == ["l1", "tool"]
 
 
-def test_three_hundred_joints_load_and_step():
-    robot = vp.planar_chain(300, length=1.0 / 300, mass=1.0 / 300)
-    motion = vp.simulate(vp.Scene(robot), np.zeros(300), np.zeros(300), dt=1e-5, steps=1)
-    assert np.isfinite(motion.q).all()
-    assert abs(motion.energy[-1] - motion.energy[0]) < 1e-9
-
-
 def test_threads_that_load_at_once_keep_stderr(tmp_path, capfd):
     path = arm(tmp_path)
     with ThreadPoolExecutor(4) as pool:
