@@ -213,20 +213,9 @@ def test_arguments_of_a_motion(name, value, facts):
         motion(**{name: value})
 
 
-@pytest.mark.parametrize(
-    ("call", "facts"),
-    [
-        (lambda: vp.OpenLoop(lambda t, q, v: [0.0, 0.0]), ("(t, q, v)", "controls=law")),
-        (lambda: vp.OpenLoop(lambda: [0.0, 0.0]), ("OpenLoop", "time")),
-        (lambda: vp.OpenLoop([0.0, 0.0]), ("OpenLoop", "[0.0, 0.0]")),
-        (lambda: motion(controls=[0.1, 0.2], period=2), "period = 2"),
-        (lambda: motion(controls=vp.OpenLoop(lambda t: [0.1, 0.2]), period=2), "period = 2"),
-        (lambda: ensemble(controls=lambda t, q, v: [0.0, 0.0]), "simulate"),
-    ],
-)
-def test_controls_that_do_not_fit(call, facts):
-    with refused(vp.InputError, facts):
-        call()
+def test_laws_of_an_ensemble_are_refused():
+    with refused(vp.InputError, "simulate"):
+        ensemble(controls=lambda t, q, v: [0.0, 0.0])
 
 
 @pytest.mark.parametrize("integrator", [None, vp.Midpoint(), vp.RungeKutta4()], ids=str)

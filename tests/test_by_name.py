@@ -114,11 +114,6 @@ def test_controls_that_cannot_hold_are_refused():
     np.testing.assert_allclose(scene.holding_controls([0.5 * np.pi, 0.0]), 0.0, atol=1e-12)
 
 
-def test_gravity_as_a_number_is_answered_with_the_vector_meant():
-    with refused(vp.InputError, "gravity", "(0, 0, -9.81)"):
-        vp.Scene(UR5, gravity=-9.81)
-
-
 def test_torques_of_some_joints_in_another_order_take_names():
     driven = ("wrist_1_joint", "elbow_joint", "wrist_3_joint")
     scene = vp.Scene(UR5, actuation=list(driven))

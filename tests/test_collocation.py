@@ -224,22 +224,3 @@ def test_a_correction_that_leaves_nothing_is_not_looked_at(name, integrator):
     assert np.mean(seen.statistics.sweeps >= stages) > 0.9
     for ours, theirs in ((own.q, seen.q), (own.p, seen.p)):
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=2e-13 * np.abs(theirs).max())
-
-
-@pytest.mark.parametrize(
-    ("kind", "option", "facts"),
-    [
-        *((kind, *own) for kind in (vp.Gauss, vp.Radau) for own in (
-            ({"stages": 0}, ("stages", "1", "0")),
-            ({"stages": 7}, ("stages", "6", "7")),
-            ({"stages": 2.5}, ("stages", "2.5")),
-            ({"stages": "two"}, ("stages", "'two'")),
-            ({"guard": 3}, ("guard", "varpin.Guard", "None", "3")),
-        )),
-        (vp.Guard, {"max_halvings": 31}, ("max_halvings", "30", "31")),
-        (vp.Radau, {"kick": "right"}, ("kick", "'left'", "'split'", "'right'")),
-    ],
-)  # fmt: skip
-def test_options_out_of_range(kind, option, facts):
-    with refused(vp.InputError, facts):
-        kind(**option)

@@ -103,22 +103,6 @@ def test_payload_is_what_pinocchio_makes_of_it(load):
     np.testing.assert_allclose(found, expected[:5, :5], rtol=1e-12, atol=1e-13)
 
 
-@pytest.mark.parametrize(
-    ("given", "facts"),
-    [
-        ({"frame": "world"}, ("'ur5'", "'world'")),
-        ({"mass": 0.0}, ("payload mass", "0.0")),
-        ({"center": [0.0, 1.0]}, ("payload center", "(3,)", "(2,)")),
-        ({"inertia": [1.0, 1.0, 3.0]}, ("payload inertia", "1, 1, 3")),
-        ({"inertia": 2.0}, ("payload inertia", "(3, 3)", "2")),
-        ({"inertia": [[1.0, 0.5, 0], [0, 1.0, 0], [0, 0, 1.0]]}, ("payload inertia", "symmetric")),
-    ],
-)
-def test_payload_that_cannot_be(given, facts):
-    with refused(vp.InputError, facts):
-        vp.load_robot("ur5", payload=vp.Payload(**{"frame": "tool0", "mass": 1.0} | given))
-
-
 def every_force(robot):
     """Forces on all joints in every form of their values, and between two fingers."""
     n = robot.dof

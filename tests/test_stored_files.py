@@ -310,13 +310,6 @@ def test_places_of_files(motion, tmp_path):
     assert (tmp_path / "new.npz").stat().st_mode & 0o777 == 0o640
 
 
-@pytest.mark.parametrize("path", [3, None, "a\0b", b"a"])
-def test_what_is_no_path(motion, path):
-    for call in (motion.save, vp.Trajectory.load):
-        with refused(vp.InputError, "path"):
-            call(path)
-
-
 def test_robots_of_motions_are_told_apart(motion, tmp_path):
     """The UR arms share their joint names; their links weigh differently."""
     small, other = vp.load_robot("ur5"), vp.load_robot("ur10")
@@ -365,11 +358,3 @@ def test_a_solution_of_another_problem_is_refused(other, of_file, of_plan, tmp_p
             vp.Solution.load(path, theirs)
         with refused(vp.InputError, of_plan):
             vp.solve(theirs, resume=plan)
-
-
-def test_resume_of_something_else():
-    plan = vp.solve(problem_of(), max_iterations=1)
-    with refused(vp.InputError, "resume"):
-        vp.solve(problem_of(), plan, resume=plan)
-    with refused(vp.InputError, "Solution"):
-        vp.solve(problem_of(), resume=plan.trajectory)
