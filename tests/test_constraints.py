@@ -496,3 +496,14 @@ def test_against_differences_of_steps_along_the_constraints(kind, integrator):
         terms, bends = slope[:, None] * H * slope, z @ J * bend
         size = max(np.abs(terms).max(), np.abs(bends).max())
         assert abs(second(ends) - terms.sum() - bends.sum()) < 1e-7 * size
+
+
+@pytest.mark.parametrize(
+    "constraint", [vp.PointOnPoint("joint3", (5.0, 0.0, 0.0)), vp.Distance("joint3", (0.0, 0.0, 4.0), 0.5)], ids=repr
+)
+def test_an_assembly_that_cannot_be_names_a_place_nearby(constraint):
+    """A target out of reach: polishing to rounding must not lead away from where the search ended."""
+    with pytest.raises(vp.AssemblyError) as info:
+        vp.assemble(vp.Scene(vp.planar_chain(3), constraints=constraint), [0.3, 0.4, 0.2])
+    assert np.abs(info.value.q).max() < 10.0
+    assert info.value.miss < 3.8

@@ -5,9 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from findings import about
 from mechanisms import random_tree
 from oracles import Mechanism, slope
-from refusals import refused
+from refusals import refused, unnamed
 
 import varpin as vp
 from varpin.control import solution_trajectory
@@ -382,3 +383,15 @@ def test_plans_in_files_keep_their_scene(tmp_path):
         assert vp.linearize(scene, motion).steps == 5
         with refused(vp.InputError, "damping"):
             vp.linearize(vp.Scene(vp.planar_chain(2)), motion)
+
+
+def test_a_checked_linearization_has_a_verdict():
+    chain, q, v = vp.planar_chain(2), [0.3, -0.2], [1.0, 0.5]
+    good = vp.check_linearization(vp.Scene(chain, damping=0.1), q, v, dt=1e-2)
+    assert good.holds
+    assert about(str(good).splitlines()[-1], "right derivatives")
+    coarse = vp.check_linearization(vp.Scene(chain, damping=0.1), q, v, dt=1e-2, step=1.0)
+    assert not coarse.holds
+    assert about(str(coarse), "another difference")
+    wrong = type(good)(A=good.A, B=(0.5, 1.0), G=good.G)
+    assert not unnamed(str(wrong).splitlines()[-1], "B", "5.0e-01")

@@ -21,6 +21,18 @@ from varpin.control.checks import foreseen
 from varpin.model.kinematics import frame_kinematics
 
 
+def test_slopes_of_a_pose_are_differences_far_from_it():
+    """Where it is met, those of the logarithm are none."""
+    robot, rng = vp.load_robot("ur5"), np.random.default_rng(1)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    goal = vp.ReachFrame(robot, "tool0", [0.4, 0.1, 0.3], turn * np.linalg.det(turn))
+    given = {"q0": np.zeros(6), "v0": np.zeros(6), "dt": 0.01, "steps": 3, "constraints": goal}
+    (bound,) = vp.OptimalControlProblem(vp.Scene(robot), vp.ControlCost(1.0), **given).bound_constraints
+    q, v, u = rng.normal(size=(4, 6)), np.zeros((4, 6)), np.zeros((3, 6))
+    found = [(bound.value(q + e, v, u) - bound.value(q - e, v, u)) / 2e-6 for e in 1e-6 * np.eye(6)]
+    np.testing.assert_allclose(bound.jacobian(q, v)[:, :, :6], np.stack(found, axis=2), atol=1e-8)
+
+
 def test_unknown_frames():
     with refused(vp.UnknownFrame, "'hand'"):
         vp.KeepInBox(TWO, "hand", 0, 1)
