@@ -316,11 +316,21 @@ def sliding():
     return vp.Scene(vp.load_robot(model))
 
 
-@pytest.mark.parametrize("integrator", [vp.ExplicitEuler(), vp.SemiImplicitEuler(), vp.RungeKutta4()], ids=str)
-def test_where_a_mass_matrix_is_singular(integrator):
-    starts, given = [[0.0, at] for at in (1.0, 2.0, -0.5, 1.0)], {"dt": 1e-3, "steps": 3, "integrator": integrator}
-    paths = vp.simulate_ensemble(sliding(), starts, [0.0, 0.0], paths=4, rng=0, **given)
-    assert [(own.path, own.step) for own in paths.failures] == [(2, 0)]
+@pytest.mark.parametrize("method", core.ExplicitMethod)
+def test_where_a_mass_matrix_is_singular(method):
+    scene = sliding()
+    at = np.array([[0.0, 1.0], [0.0, 2.0], [0.0, -0.5], [0.0, 1.0]])
+    nothing = np.zeros_like(at)
+    assert core.accelerations(scene.core, at, nothing, nothing)[-1] == 2
+    assert core.linearize_explicit(scene.core, method, 1e-3, at, nothing, nothing[:, None])[-1] == 2
+    nodes = new_nodes(4, 3, 2, 2)
+    assert not core.ExplicitRollout.start(scene.core, method, at, nothing).first_nodes(nodes)
+    core.ExplicitRollout.start(scene.core, method, at, nothing).roll(
+        1e-3, open_loop(np.zeros((3, 2))), np.zeros((0, 0, 0)), np.zeros((0, 0, 2)), nodes
+    )
+    assert nodes.done.tolist() == [3, 3, 0, 3]
+    ends = core.Outcome.solved, core.Outcome.singular
+    assert nodes.ended.tolist() == [ends[0], ends[0], ends[1], ends[0]]
 
 
 @pytest.mark.parametrize(

@@ -138,21 +138,6 @@ def test_policy_on_velocities_and_back():
     assert again.history[0].expected_decrease < 1e-2 * again.cost
 
 
-def test_monte_carlo_against_paths_one_by_one():
-    plan = vp.solve(linear(noise=vp.AdditiveNoise(0.2) + vp.ControlNoise(0.3), integrator=vp.Midpoint()))
-    problem, rng = plan.problem, np.random.default_rng(3)
-    whole = plan.monte_carlo(4000, 1)
-    assert (whole.predicted, whole.paths, whole.failures) == (plan.expected_cost, 4000, 0)
-    assert plan.noise_cost > 10 * whole.standard_error
-    assert abs(whole.cost - whole.predicted) < 4 * whole.standard_error
-    for feedback, controls in ((True, plan.policy), (False, plan.controls)):
-        costs = np.array([problem.cost_of(problem.simulate(controls, rng=rng)) for _ in range(1000)])
-        found = plan.monte_carlo(1000, 5, feedback=feedback)
-        error = costs.std(ddof=1) / np.sqrt(1000)
-        assert found.standard_error == pytest.approx(error, rel=0.3)
-        assert abs(costs.mean() - found.cost) < 4 * np.hypot(error, found.standard_error)
-
-
 def test_monte_carlo_repeats():
     plan = vp.solve(linear(noise=vp.AdditiveNoise(0.2)))
     first = plan.monte_carlo(600, 7, workers=1)
@@ -165,6 +150,15 @@ def test_monte_carlo_repeats():
     own = vp.CustomNoise(lambda q, v, u: 0.2 * np.eye(2), 2)
     alone = dataclasses.replace(plan, problem=linear(noise=own)).monte_carlo(6, 3)
     assert alone.cost == pytest.approx(plan.monte_carlo(6, 3).cost, rel=1e-12)
+
+
+def test_monte_carlo_is_the_mean_of_its_paths():
+    plan = vp.solve(linear(noise=vp.AdditiveNoise(0.2) + vp.ControlNoise(0.3), integrator=vp.Midpoint()))
+    for feedback, given in ((True, plan.policy), (False, plan.controls)):
+        found, children = plan.monte_carlo(8, 5, feedback=feedback), np.random.default_rng(5).spawn(8)
+        costs = [plan.problem.cost_of(plan.problem.simulate(given, rng=child)) for child in children]
+        assert (found.cost, found.predicted) == (pytest.approx(np.mean(costs), rel=1e-12), plan.expected_cost)
+        assert found.standard_error == pytest.approx(np.std(costs, ddof=1) / np.sqrt(8), rel=1e-9)
 
 
 def test_monte_carlo_interrupted_holds_the_paths_done():
