@@ -407,7 +407,7 @@ def test_a_blow_within_a_step_is_held_against_the_limit_of_efforts():
     assert told.time == pytest.approx(0.1)
 
 
-# --- random motions, of which ``python tests/random_motions.py`` judges hundreds --------------------------------------
+# --- random motions, of which benchmarks/judged_motions.py judges hundreds --------------------------------------------
 
 # Of methods that are given, so that no better choice makes them right.
 WRONG_MOTIONS = (13, 20, 52, 54, 65, 94, 143, 154, 224, 226, 248, 264, 284)

@@ -274,14 +274,17 @@ def test_a_motion_under_a_function_of_time_is_linearized():
         assert_allclose(lin.B[0, :, c], found, atol=1e-8 * np.abs(lin.B[0]).max())
 
 
-@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
-def test_a_tolerance_divides_lines_as_the_input_moves(interpolation):
+@over_interpolations
+@pytest.mark.parametrize("kind", ["rows", "lines"])
+def test_a_tolerance_divides_steps_as_the_input_moves(kind, interpolation):
     scene = arm(interpolation)
     nodes = np.array([wanted(scene, x) for x in np.linspace(0.0, SPAN, 9)])
-    coarse = vp.FirstOrderHold(nodes)
-    found = vp.simulate(scene, Q0, V0, duration=SPAN, tolerance=1e-7, controls=coarse)
-    fine = vp.simulate(scene, Q0, V0, dt=SPAN / 8, steps=8, controls=coarse, integrator=vp.Gauss(6), check=False)
-    assert_allclose(found.q[-1], fine.q[-1], atol=1e-6)
+    given = nodes[1:] if kind == "rows" else vp.FirstOrderHold(nodes)
+    found = vp.simulate(scene, Q0, V0, duration=SPAN, tolerance=1e-7, controls=given)
+    assert found.accuracy.met
+    assert_allclose(found.q[:: found.steps // 8][1:, 0], nodes[1:, 0], atol=1e-13)
+    fine = vp.simulate(scene, Q0, V0, dt=SPAN / 8, steps=8, controls=given, integrator=vp.Gauss(6), check=False)
+    assert_allclose(found.q[-1], fine.q[-1], atol=1e-7)
 
 
 def test_a_tolerance_follows_a_function_of_time():
