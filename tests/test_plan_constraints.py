@@ -58,12 +58,10 @@ def test_unknown_frames():
 
 
 def test_monte_carlo_counts_what_margins_allow():
-    limits = vp.WithinJointLimits(TWO, (-0.2, [0.9, 0.6]), margin=2.0)
     free = vp.WithinVelocityLimits(TWO, (-50.0, 50.0), margin=2.0)
-    scene = vp.Scene(TWO, damping=0.3, noise=vp.AdditiveNoise(0.3))
-    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1.0) + vp.Terminal(vp.TrackingCost([1.0, 0.5], 100.0))
-    constraints = [vp.WithinVelocityLimits(TWO, (-60.0, 60.0)), limits, free]
-    problem = vp.OptimalControlProblem(scene, cost, [0, 0], [0, 0], dt=0.03, steps=40, constraints=constraints)
+    problem = beside_a_limit(vp.AdditiveNoise(0.3))
+    (limits,), scene = problem.constraints, problem.scene
+    problem = problem.at(constraints=[vp.WithinVelocityLimits(TWO, (-60.0, 60.0)), limits, free])
     plan, paths = vp.solve(problem, check=False), 1000
     seen = plan.monte_carlo(paths, rng=1)
     options = {"controls": plan.policy, "integrator": problem.integrator}
