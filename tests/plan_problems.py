@@ -196,7 +196,7 @@ SMALL = {
     "held, in a sphere": row(3.8353273, vp.KeepInSphere(TWO, "tip", [1.5, 0.0, -0.5], 1.4)),
     "held, out of a sphere": row(31.868422, SPHERE, scipy=True),
     "held, out of a moving sphere": row(
-        28.956314, vp.KeepOutOfSphere(TWO, "tip", lambda t: [0.4 * t - 1.0, 0.0, -1.4], 0.3), t0=5.0
+        2.1928645, vp.KeepOutOfSphere(TWO, "tip", lambda t: [0.4 * t - 1.95, 0.0, -1.0], 0.2), t0=5.0
     ),
     "held, clear of a ball": row(2.288535, CLEAR, kkt=1e-4),
     "held, clear of a moving ball": row(2.774077, MOVING, t0=5.0),
