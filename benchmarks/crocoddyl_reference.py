@@ -331,7 +331,6 @@ def pontryagin(problem: Problem, model: pin.Model, plan: Plan) -> dict[str, Any]
         "samples": {
             "t": rounded(grid),
             "q": rounded(values[:, :n]),
-            "v": rounded(values[:, n : 2 * n]),
             "u": rounded(np.array([torque(row) for row in values])),
         },
     }
@@ -345,25 +344,11 @@ def rounded(values: np.ndarray) -> Any:
     return [float(f"{value:.6g}") for value in values]
 
 
-def sampled(plan: Plan, n: int) -> dict[str, Any]:
-    """Every N/50-th node: the state there, and the torque held over the step that begins there."""
-    nodes = np.arange(0, plan.N, plan.N // SAMPLES)
-    return {
-        "integrator": plan.integrator,
-        "N": plan.N,
-        "t": rounded(nodes * plan.dt),
-        "q": rounded(plan.x[nodes, :n]),
-        "v": rounded(plan.x[nodes, n:]),
-        "u": rounded(plan.u[nodes]),
-        "last": {"q": rounded(plan.x[-1, :n]), "v": rounded(plan.x[-1, n:]), "u": rounded(plan.u[-1])},
-    }
-
-
-def measured(problem: Problem) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """What is stored of a problem, and the times apart."""
+def measured(problem: Problem) -> dict[str, Any]:
+    """What is stored of a problem."""
     model = problem.model()
     require_gravity(model)
-    runs, times, richardson = [], [], {}
+    runs, richardson = [], {}
     for integrator, order in (("Euler", 1), ("RK4", 2)):
         plans = []
         for N in problem.steps:
@@ -385,14 +370,6 @@ def measured(problem: Problem) -> tuple[dict[str, Any], list[dict[str, Any]]]:
                 run["true_cost"] = open_loop(problem, model, lambda k, _, u=plan.u: u[k], knots, plan.cost)
             runs.append(run)
             per_node = 1e6 * plan.seconds / plan.iterations / N
-            times.append(
-                {
-                    "integrator": integrator,
-                    "N": N,
-                    "solve_s": float(f"{plan.seconds:.4g}"),
-                    "per_iteration_and_node_us": float(f"{per_node:.3g}"),
-                }
-            )
             print(
                 f"{integrator:5} {N:6d} {plan.cost:.10e} {plan.iterations:4d} {plan.stop:8.1e} {plan.converged!s:5} "
                 f"{run['cost_check']:8.1e} {defect:8.1e} {run.get('true_cost', np.nan):.8e} "
@@ -405,7 +382,7 @@ def measured(problem: Problem) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     optimum = pontryagin(problem, model, finest)
     for name, value in (*richardson.items(), ("optimum", optimum)):
         print(f"{name:8} {value['cost']:.10e} +- {value['uncertainty']:.1e}", flush=True)
-    stored = {
+    return {
         "robot": problem.robot,
         "lock": problem.lock,
         "gravity": model.gravity.linear.tolist(),
@@ -416,9 +393,7 @@ def measured(problem: Problem) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         "optimum": optimum,
         "richardson": richardson,
         "runs": runs,
-        "finest": sampled(finest, model.nv),
     }
-    return stored, times
 
 
 def text(value: Any, indent: str = "") -> str:
@@ -437,16 +412,15 @@ def main() -> None:
     if len(sys.argv) != 2:
         raise SystemExit("usage: crocoddyl_reference.py OUTPUT.json")
     packages = ("crocoddyl", "pin", "libpinocchio", "numpy", "scipy")
-    problems, times = {}, {}
+    problems = {}
     for name, problem in PROBLEMS.items():
         print(name, flush=True)
-        problems[name], times[name] = measured(problem)
+        problems[name] = measured(problem)
     document = {
         "made_by": "benchmarks/crocoddyl_reference.py, whose docstring explains every entry; SI units",
         "versions": {"python": platform.python_version(), **{package: version(package) for package in packages}},
         "settings": {"th_stop": THRESHOLD, "reg_min": REGULARIZATION},
         "problems": problems,
-        "times": {"machine": f"{platform.machine()}, one thread, shared with other work", **times},
     }
     output = Path(sys.argv[1])
     output.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Checks of the force that docs/extending.md adds to the core. test_extending.py runs them behind the page's code."""
+"""Checks of the force that docs/extending.md adds to the core. test_docs.py runs them behind the page's code."""
 
 import numpy as np
 import pytest

@@ -16,17 +16,9 @@ from selenium.webdriver.chrome.service import Service
 
 from varpin.model import geometry
 
-FLAGS = [
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-component-update",
-    "--disable-dev-shm-usage",
-    "--window-size=800,600",
-]
+FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader"]
+FLAGS += ["--enable-unsafe-swiftshader", "--disable-component-update", "--disable-dev-shm-usage"]
+FLAGS += ["--window-size=800,600"]
 
 # Without a graphics card drawing takes most of the time, and most tests look at what is drawn, not at the picture.
 UNDRAWN = """

@@ -257,6 +257,25 @@ class Mechanism:
         return 0.5 * float(v @ self.mass_matrix(q) @ v) + weight + self.forces(q, v, np.zeros(self.n))[0]
 
 
+def assert_jet(scene: vp.Scene, q: np.ndarray, v: np.ndarray, backend: str) -> None:
+    """The Lagrangian and its derivatives against Pinocchio's energies, along a direction by differences."""
+    own, dq = Mechanism(scene), np.random.default_rng(4).uniform(-1.0, 1.0, q.size)
+    jet, M = vp.lagrangian_jet(scene, q, v, backend=backend), own.mass_matrix(q)
+
+    def L(q: np.ndarray) -> float:
+        return v @ own.mass_matrix(q) @ v - own.energy(q, v)
+
+    size = np.abs(jet.Lq).max() + np.abs(jet.Lqq).max() + abs(jet.L)
+    assert abs(jet.L - L(q)) < 1e-12 * size
+    np.testing.assert_allclose(jet.Lvv, M, rtol=0, atol=1e-12 * np.abs(M).max())
+    np.testing.assert_allclose(jet.Lv, M @ v, rtol=0, atol=1e-12 * np.abs(jet.Lv).max())
+    assert abs(jet.Lq @ dq - slope(L, q, dq, 0.02)) < 1e-10 * size
+    in_q = slope(lambda x: vp.lagrangian_jet(scene, x, v, backend=backend).Lq, q, dq, 0.02)
+    np.testing.assert_allclose(jet.Lqq @ dq, in_q, rtol=0, atol=1e-9 * size)
+    in_q = slope(lambda x: own.mass_matrix(x) @ v, q, dq, 0.02)
+    np.testing.assert_allclose(jet.Lvq @ dq, in_q, rtol=0, atol=1e-9 * size)
+
+
 def normals(own: vp.Constraint) -> np.ndarray:
     """Directions (k, 3) along which two points of a constraint coincide."""
     if isinstance(own, vp.PointOnPoint):
@@ -342,7 +361,8 @@ def plan_rows(
     problem: vp.OptimalControlProblem, motion: vp.Trajectory, controls: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rows c <= 0 and rows c = 0 of a problem's constraints at a motion's nodes, all but the first."""
-    robot, q, v, t = problem.scene.robot, motion.q[1:], motion.v[1:], motion.t[1:]
+    robot, q, v = problem.scene.robot, motion.q[1:], motion.v[1:]
+    t = problem.t0 + motion.t[1:] - motion.t[0]
     below, zero = [np.zeros(0)], [np.zeros(0)]
     for own in problem.constraints:
         match own:
@@ -367,7 +387,7 @@ def plan_rows(
                 far = np.linalg.norm(robot.frame_positions(q, own.frame) - center, axis=1) - own.radius
                 below.append(far if isinstance(own, vp.KeepInSphere) else -far)
             case vp.KeepClear():
-                below.append(np.array([own.distance - gap for gap in clearances(own, q)]))
+                below.append(np.array([own.distance - gap for gap in clearances(own, q, t)]))
             case _:
                 raise TypeError(f"no rows for {own!r}")
     flat = [np.concatenate([np.ravel(part) for part in parts]) for parts in (below, zero)]
@@ -383,16 +403,17 @@ def placements(robot: vp.Robot, q: np.ndarray, frame: str) -> list[pin.SE3]:
     return found
 
 
-def clearances(own: vp.KeepClear, q: np.ndarray) -> np.ndarray:
-    """The least distance between capsules of links and balls at configurations (K, n)."""
+def clearances(own: vp.KeepClear, q: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """The least distance between capsules of links and balls at configurations (K, n) at times (K,)."""
     gaps = []
     for link, (begin, end, radius) in own.capsules.items():
         for k, place in enumerate(placements(own.robot, q, link)):
             a, b = (place.act(np.asarray(point, float)) for point in (begin, end))
             for ball in own.obstacles:
                 assert ball.sides is None
-                share = np.clip((ball.begin - a) @ (b - a) / max((b - a) @ (b - a), 1e-300), 0.0, 1.0)
-                gaps.append((k, np.linalg.norm(a + share * (b - a) - ball.begin) - radius - ball.radius))
+                at = ball.begin + (0.0 if ball.shift is None else np.array(ball.shift(t[k])))
+                share = np.clip((at - a) @ (b - a) / max((b - a) @ (b - a), 1e-300), 0.0, 1.0)
+                gaps.append((k, np.linalg.norm(a + share * (b - a) - at) - radius - ball.radius))
     return np.array([min(gap for at, gap in gaps if at == k) for k in range(len(q))])
 
 

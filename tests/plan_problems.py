@@ -176,6 +176,8 @@ LINE = np.linspace(0.0, 1.0, 13)[:, None] * np.array([1.0, 0.5])
 JOINTS, GOAL = vp.WithinJointLimits(TWO, (-0.05, [0.9, 2.0])), tip()
 SPHERE = vp.KeepOutOfSphere(TWO, "tip", [1.3, 0.0, -1.3], 0.3)
 CLEAR = vp.KeepClear(TWO, [vp.Obstacle.sphere([1.5, 0.0, -1.25], 0.15)], 0.05, capsules=CAPSULES)
+WAY = vp.Obstacle.sphere([0.0, 0.0, -0.95], 0.15).moving(lambda t: [0.5 * t - 2.49, 0.0, 0.0])
+MOVING = vp.KeepClear(TWO, [WAY], 0.05, capsules=CAPSULES)
 CHANGES = vp.ControlRateCost(1e-4, before=[14.0, 4.0])
 SECOND = {"second_order": True}
 ADDED, STEERED = noisy(vp.AdditiveNoise(0.3)), noisy(vp.ControlNoise(0.03))
@@ -194,9 +196,10 @@ SMALL = {
     "held, in a sphere": row(3.8353273, vp.KeepInSphere(TWO, "tip", [1.5, 0.0, -0.5], 1.4)),
     "held, out of a sphere": row(31.868422, SPHERE, scipy=True),
     "held, out of a moving sphere": row(
-        28.956314, vp.KeepOutOfSphere(TWO, "tip", lambda t: [1.0 + 0.4 * t, 0.0, -1.4], 0.3)
+        2.1928645, vp.KeepOutOfSphere(TWO, "tip", lambda t: [0.4 * t - 1.95, 0.0, -1.0], 0.2), t0=5.0
     ),
     "held, clear of a ball": row(2.288535, CLEAR, kkt=1e-4),
+    "held, clear of a moving ball": row(2.774077, MOVING, t0=5.0),
     "held, change of controls": row(3.7537843, speeds(2.2), more=CHANGES),
     "held over 3 steps": row(9.465277, speeds(2.2), hold=3, kkt=1e-4, scipy=True, **FINER, **LIMITS),
     "held over 2 steps, rates": row(2.1258071, vp.WithinControlRate(110.0), hold=2, **FINER),

@@ -1,12 +1,6 @@
-"""Random motions that judge the check of ``vp.simulate``: python tests/random_motions.py --count 400 --seed 0."""
+"""Random motions that judge the check of ``vp.simulate``; benchmarks/judged_motions.py judges hundreds."""
 
-import argparse
-import hashlib
 import itertools
-import logging
-import sys
-import timeit
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -31,8 +25,6 @@ NO_ERRORS = ("position limits", "velocity limits", "effort limits", "open loops"
 WRONG, STRICT, RIGHT = np.array([0.05, 0.25]), np.array([0.01, 0.25]), np.array([0.003, 0.075])
 PATIENCE = 600_000  # evaluations after which a true motion is given up
 AT = np.array([0.05, 0.1, 0.15])  # where a spring pulls, in its frame's axes [m]
-COLUMNS = ("failed", "unknown", "off", "untold", "off 1%", "untold 1%", "right", "told", "loop")
-LEVELS = (0.025, 0.05, 0.5, 0.95, 0.975)
 
 
 class Case(NamedTuple):
@@ -198,26 +190,13 @@ def run(case: Case, given: object, rtol: float) -> Array:
     return np.array([case.q0 + q, v])
 
 
-def truth(case: Case, cache: Path | None = None) -> Truth | None:
+def truth(case: Case) -> Truth | None:
     """The true motion, a law called with its states. None: unknown."""
-    given, q0, v0 = case.controls, case.q0, case.v0
-    now = given.f(case.dt) if isinstance(given, vp.OpenLoop) else given(0.0, q0, v0) if callable(given) else given
-    acting = Mechanism(case.scene).forces(q0, v0, v0)
-    probe = [q0, v0, case.dt, case.steps, *acting, 0.0 if now is None else now]
-    key = hashlib.sha1(np.round(np.concatenate(probe, axis=None), 9).tobytes()).hexdigest()[:12]
-    file = None if cache is None else cache / f"{case.seed}_{key}.npz"
-    if file is not None and file.exists():
-        found = np.load(file)
-        return (found["states"], found["doubt"]) if found.files else None
     try:
-        states, coarse = run(case, given, 1e-11), run(case, given, 1e-9)
-        made = {"states": states, "doubt": np.abs(states - coarse).max(axis=1)}
+        states, coarse = run(case, case.controls, 1e-11), run(case, case.controls, 1e-9)
     except (ArithmeticError, ValueError):
-        made = {}
-    if file is not None:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(file, **made)
-    return tuple(made.values()) or None
+        return None
+    return states, np.abs(states - coarse).max(axis=1)
 
 
 class Verdict(NamedTuple):
@@ -255,40 +234,3 @@ def judge(case: Case, motion: vp.Trajectory, real: Truth | None) -> Verdict:
     if estimate is not None and off[0].max() > least:
         factor = float(np.max(estimate) / off[0].max())
     return Verdict(frozenset(labels if (doubt < 0.2 * WRONG).all() else {"unknown"}), told, tuple(share), factor)
-
-
-def verdict_of(seed: int, cache: Path | None = None) -> tuple[Case, Verdict]:
-    case = draw(seed)
-    try:
-        motion = case.simulate()
-        runs = [timeit.repeat(lambda on=on: case.simulate(on), number=1, repeat=2) for on in (False, True)]
-    except vp.StepFailure as error:
-        return case, Verdict(frozenset({"failed"}), (str(error),))
-    return case, judge(case, motion, truth(case, cache))._replace(seconds=tuple(map(min, runs)))
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    for name, kind, start in (("count", int, 400), ("seed", int, 0), ("only", int, None), ("cache", Path, None)):
-        parser.add_argument(f"--{name}", type=kind, default=start)
-    asked = parser.parse_args()
-    logging.disable(logging.CRITICAL)
-    seeds = range(asked.seed, asked.seed + asked.count) if asked.only is None else [asked.only]
-    found = [verdict_of(seed, asked.cache) for seed in seeds]
-    heads = ("n", *COLUMNS, *map("{:.3g}".format, LEVELS), "in 2", "time")
-    out = ["kind     " + "".join(f"{name:>10s}" for name in heads)]
-    for kind in (*KINDS, "all"):
-        own = [verdict for case, verdict in found if kind in (case.kind, "all")]
-        factors = np.array([one.factor for one in own if np.isfinite(one.factor)] or [np.nan])
-        bare, checked = np.sum([one.seconds for one in own], axis=0) if own else (1.0, np.nan)
-        numbers = [len(own), *(sum(name in one.labels for one in own) for name in COLUMNS)]
-        numbers += [*np.quantile(factors, LEVELS), np.mean(np.abs(np.log2(factors)) <= 1.0), checked / bare]
-        out.append(f"{kind:9s}" + "".join(f"{number:10.3g}" for number in numbers))
-    for name in ("untold", "told", "unknown", "failed") if asked.only is None else found[0][1].labels:
-        lines = [f"{case}: {own}" for case, own in found if name in own.labels]
-        out += [f"\n{name}: {len(lines)}", *lines]
-    sys.stdout.write("\n".join([*out, ""]))
-
-
-if __name__ == "__main__":
-    main()

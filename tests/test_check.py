@@ -12,7 +12,7 @@ import pytest
 from findings import about
 from mechanisms import slider
 from random_motions import draw, judge, truth
-from refusals import refused, unnamed
+from refusals import unnamed
 
 import varpin as vp
 from varpin.model.chain import rod_chain
@@ -346,16 +346,6 @@ def test_unsettled_functions():
     assert not unnamed(told, "2 steps", "breaks=")
 
 
-def test_a_function_that_fails():
-    failing = vp.OpenLoop(lambda t: np.ones(3) if t < 0.123 else 1 / 0)
-    for integrator in (None, MIDPOINT, RK4):
-        with refused(vp.ControlError, "division by zero") as caught:
-            moved(FREE, integrator, dt=0.01, controls=failing)
-        assert caught.value.step == caught.value.trajectory.steps == 12
-        same = moved(FREE, integrator, dt=0.01, steps=12, controls=np.ones(3), check=False)
-        np.testing.assert_allclose(caught.value.trajectory.q, same.q, atol=1e-12)
-
-
 def test_findings(tmp_path):
     own = vp.Finding("error", "too far", "joint2", time=0.5, value=0.1, unit="rad")
     numbers = {"kind": "error", "joint": "joint2", "time": 0.5, "value": 0.1, "unit": "rad"}
@@ -417,7 +407,7 @@ def test_a_blow_within_a_step_is_held_against_the_limit_of_efforts():
     assert told.time == pytest.approx(0.1)
 
 
-# --- random motions, of which ``python tests/random_motions.py`` judges hundreds --------------------------------------
+# --- random motions, of which benchmarks/judged_motions.py judges hundreds --------------------------------------------
 
 # Of methods that are given, so that no better choice makes them right.
 WRONG_MOTIONS = (13, 20, 52, 54, 65, 94, 143, 154, 224, 226, 248, 264, 284)

@@ -110,6 +110,7 @@ MISTAKES = [
     ("simulate ARM --damping -1", ("damping[0]", "-1.0")),
     ("simulate ARM --duration 1 --dt 0.003", ("duration = 1 s", "dt = 0.003 s", f"dt = {1 / 333!r} s")),
     ("simulate ARM --tolerance 1e-6 --dt 0.1", ("dt", "tolerance")),
+    ("simulate ARM --tolerance 1e-6 --steps 1", ("steps", "tolerance")),
     ("simulate ARM --integrator gaus", ("'gaus'", "Gauss", "Midpoint")),
     ("simulate ARM --integrator RungeKutta4(stages=2)", ("'stages'", "RungeKutta4")),
     ("simulate ARM --q0 elbow=1 2", ("--q0", "JOINT=VALUE")),

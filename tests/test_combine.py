@@ -4,7 +4,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from mechanisms import joint, link, mimic, random_rotation, random_tree, write_urdf
-from refusals import refused
 
 import varpin as vp
 from varpin.model import geometry, readable_geometry
@@ -170,22 +169,3 @@ def test_names_that_clash_get_a_prefix(arms):
     assert len(geometry(four).geometryObjects) == 4 * 7 + 11
     locked = vp.load_robot("ur5", lock={"wrist_3_joint": 0.3})
     assert vp.combine(locked, locked).locked == {"a_wrist_3_joint": 0.3, "b_wrist_3_joint": 0.3}
-
-
-@pytest.mark.parametrize(
-    ("robots", "options", "facts"),
-    [
-        (1, {}, "robots"),
-        (["ur5"], {}, "robots"),
-        (2, {"placements": [None]}, ("placements", "2")),
-        (2, {"placements": [None, "planar"]}, "base="),
-        (2, {"placements": [None, [2.0, 0.0, 0.0]]}, ("placements", "'chain2'")),
-        (2, {"placements": [None, 2.0 * np.eye(4)]}, "rotation"),
-        (2, {"prefixes": "ab"}, "prefixes"),
-        (2, {"prefixes": ["", ""]}, "'joint1'"),
-    ],
-)
-def test_wrong_combinations_are_refused(robots, options, facts):
-    given = [vp.planar_chain(2)] * robots if isinstance(robots, int) else [vp.planar_chain(2), *robots]
-    with refused(vp.InputError, facts):
-        vp.combine(*given, **options)

@@ -149,20 +149,6 @@ def test_of_a_start_off_the_constraints_it_is_said_that_it_was_moved(caplog):
     np.testing.assert_allclose(paths.q[1], alone.q, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
-def test_a_tolerance_beside_a_joint_that_is_moved_by_hand_keeps_its_path(interpolation):
-    hand = vp.KinematicInput("joint1", interpolation)
-    scene = vp.Scene(vp.planar_chain(3), actuation=["joint1"], constraints=hand)
-    t = np.linspace(0.0, 1.0, 9)[1:]
-    u = np.column_stack([0.5 * (1.0 - np.cos(3.0 * t)), 1.5 * np.sin(3.0 * t)])[:, : scene.controls]
-    start = np.array([0.0, 1.5, 0.0]), np.zeros(3)
-    motion = vp.simulate(scene, *start, duration=1.0, tolerance=1e-7, controls=u)
-    assert motion.accuracy.met
-    np.testing.assert_allclose(motion.q[:: motion.steps // 8][1:, 0], u[:, 0], atol=1e-13)
-    fine = vp.simulate(scene, *start, duration=1.0, tolerance=1e-11, controls=u, integrator=vp.Gauss(3))
-    assert np.abs(motion.q[-1] - fine.q[-1]).max() < 1e-7
-
-
 def test_work_and_precision_under_constraints():
     scene, q = five_bar()
     v = along_constraints(scene, q, np.array([1.0, 0.0, 0.0, 2.0]))

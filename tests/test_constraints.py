@@ -1,4 +1,4 @@
-"""Holonomic constraints: rows against differences and Pinocchio, assembly, failures; the battery has their motions."""
+"""Holonomic constraints: rows and second derivatives against differences and Pinocchio, assembly, and failures."""
 
 import numpy as np
 import pinocchio as pin
@@ -9,7 +9,7 @@ from refusals import refused, unnamed
 from scipy.optimize import minimize
 
 import varpin as vp
-from varpin.mechanics.assembly import along_constraints
+from varpin.mechanics.assembly import along_constraints, nearest
 
 
 def central(f, x, size=1e-3):
@@ -433,3 +433,77 @@ def test_rows_whose_terms_vanish_hold_from_rest():
     fixed = vp.load_robot("ur5")
     alone = vp.simulate(vp.Scene(fixed), np.zeros(6), np.zeros(6), dt=2e-3, steps=20, integrator=vp.Gauss(2))
     np.testing.assert_allclose(motion.q[:, 3:], alone.q, atol=1e-9)
+
+
+# --- second derivatives of steps -------------------------------------------------------------------------------------
+
+
+# Central differences of eighth order, of the first and of the second derivative.
+FIRST = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+SECOND = {0: -205 / 72, 1: 8 / 5, 2: -1 / 5, 3: 8 / 315, 4: -1 / 560}
+SIZE = 1e-3
+
+
+def first(values):
+    return sum(w * (values[k] - values[-k]) for k, w in FIRST.items()) / SIZE
+
+
+def second(values):
+    return (SECOND[0] * values[0] + sum(SECOND[k] * (values[k] + values[-k]) for k in range(1, 5))) / SIZE**2
+
+
+def whole(curvature):
+    return np.block([[curvature.xx[0], curvature.ux[0].T], [curvature.ux[0], curvature.uu[0]]])
+
+
+CUBIC = [zoo.CRANK[0], vp.KinematicInput("joint1", "cubic")]
+CASES = {
+    "forces": zoo.ZOO["five-bar"],
+    "linear": zoo.ZOO["cranked five-bar"],
+    "cubic": zoo.Case("", zoo.chain(4, damping=0.3, constraints=CUBIC), **zoo.FIVE, path=zoo.cranked),
+}
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(guard=None), vp.Gauss(2, guard=None)])
+@pytest.mark.parametrize("kind", CASES)
+def test_against_differences_of_steps_along_the_constraints(kind, integrator):
+    """Of z . x1 on curves through states that keep the constraints: f'' = x' H x' + z J x''."""
+    scene, q, v = CASES[kind].scene, CASES[kind].q0, CASES[kind].v0
+    rng, n = np.random.default_rng(3), 4
+    u = scene.command_at(q) + 0.01 * rng.normal(size=scene.controls)
+    given = {"dt": 1e-2, "steps": 1, "integrator": integrator, "check": False}
+    motion = vp.simulate(scene, q, v, controls=u[None], **given)
+    lin = vp.linearize(scene, motion)
+    # States that keep what is not moved by hand.
+    fixed = vp.Scene(scene.robot, constraints=scene.constraints[:1])
+    z = rng.normal(size=2 * n)
+    H = whole(vp.second_order(scene, motion, z))
+    np.testing.assert_allclose(H, H.T, rtol=1e-12, atol=1e-12 * np.abs(H).max())
+    for _ in range(3):
+        dq, dv, du = rng.normal(size=n), rng.normal(size=n), rng.normal(size=scene.controls)
+        curve, ends = {}, {}
+        for k in range(-4, 5):
+            at = nearest(fixed, q + k * SIZE * dq)
+            rate = along_constraints(fixed, at, v + k * SIZE * dv)
+            M = scene.core.jets(at[None], np.zeros((1, n)))[0][0]
+            command = u + k * SIZE * du
+            moved = vp.simulate(scene, at, rate, controls=command[None], **given)
+            curve[k] = np.concatenate([at, M @ rate, command])
+            ends[k] = z @ np.append(moved.q[1], moved.p[1])
+        slope, bend = first(curve), second(curve)
+        J = np.concatenate([lin.A[0], lin.B[0]], axis=1)
+        assert abs(first(ends) - z @ J @ slope) < 1e-8 * np.abs(z @ J * slope).max()
+        terms, bends = slope[:, None] * H * slope, z @ J * bend
+        size = max(np.abs(terms).max(), np.abs(bends).max())
+        assert abs(second(ends) - terms.sum() - bends.sum()) < 1e-7 * size
+
+
+@pytest.mark.parametrize(
+    "constraint", [vp.PointOnPoint("joint3", (5.0, 0.0, 0.0)), vp.Distance("joint3", (0.0, 0.0, 4.0), 0.5)], ids=repr
+)
+def test_an_assembly_that_cannot_be_names_a_place_nearby(constraint):
+    """A target out of reach: polishing to rounding must not lead away from where the search ended."""
+    with pytest.raises(vp.AssemblyError) as info:
+        vp.assemble(vp.Scene(vp.planar_chain(3), constraints=constraint), [0.3, 0.4, 0.2])
+    assert np.abs(info.value.q).max() < 10.0
+    assert info.value.miss < 3.8

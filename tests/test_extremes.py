@@ -46,8 +46,8 @@ def run_one(own, integrator=INTEGRATORS[1], **options):
 @pytest.fixture
 def hasty(monkeypatch):
     """Little time for the exact motions over periods, which decide nothing here."""
-    monkeypatch.setattr("battery.running._PATIENCE_PERIODS", 0.1)
-    monkeypatch.setattr("battery.running._PATIENCE_PERIOD", 0.1)
+    monkeypatch.setattr("battery._PATIENCE_PERIODS", 0.1)
+    monkeypatch.setattr("battery._PATIENCE_PERIOD", 0.1)
 
 
 # --- each check can fail -------------------------------------------------------------------------------------------

@@ -206,7 +206,7 @@ def test_ctrl_c_keeps_the_best_values(swings, tmp_path, capsys, monkeypatch):
     words = ["identify", path, one, "--q-noise", "1e-4", "--parameters", "damping", "--save", tmp_path / "a.urdf"]
     assert main([*map(str, words)]) == 130
     assert not unnamed(capsys.readouterr().err, "interrupted")
-    assert (vp.load_robot(tmp_path / "a.urdf").damping > 0.0).all()
+    assert vp.load_robot(tmp_path / "a.urdf").damping.any()
 
 
 def test_the_command_takes_a_scene_file(tmp_path, capsys):

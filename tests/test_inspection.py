@@ -1,10 +1,12 @@
 """What inspection says of sound and of faulty robots."""
 
+import logging
 from pathlib import Path
 
+import mechanisms
 import numpy as np
 import pytest
-from mechanisms import mass_matrix
+from findings import about
 from refusals import naming, refused, unnamed
 
 import varpin as vp
@@ -94,7 +96,7 @@ def test_singular_mass_matrix_names_the_joint_and_has_no_largest_step(tmp_path):
 def test_condition_number_is_that_of_the_mass_matrix():
     q = [0.1, -0.4, 0.8, 0.2, 0.5, -0.3, 0.0]
     report = inspect_robot("z1", q=q)
-    M = mass_matrix(report.robot, np.array(q), report.robot.model.createData())
+    M = mechanisms.mass_matrix(report.robot, np.array(q), report.robot.model.createData())
     scale = np.diag(np.diag(M) ** -0.5)
     assert report.condition == pytest.approx(np.linalg.cond(scale @ M @ scale))
 
@@ -176,3 +178,35 @@ def test_frames_are_listed_with_what_carries_them():
     assert frames["elbow_joint"] == vp.FrameReport("elbow_joint", "joint", "upper_arm_link", "elbow_joint")
     for name in frames:
         assert f"\n  {name} " in str(report)
+
+
+@pytest.fixture
+def gripper(tmp_path):
+    """A joint with limits of 0.5 and 1.5 rad, and a slide that follows it."""
+    turns = mechanisms.joint("turns", "base", "a").replace('lower="-1" upper="1"', 'lower="0.5" upper="1.5"')
+    follows = mechanisms.joint("follows", "base", "b", "prismatic", inside=mechanisms.mimic("turns", 0.1))
+    links = mechanisms.link("a"), mechanisms.link("b")
+    return mechanisms.write_urdf(tmp_path, *links, turns.replace('velocity="8"', 'velocity="1"'), follows)
+
+
+def test_a_leader_that_turns_is_an_angle_whatever_follows(gripper):
+    robot = vp.load_robot(gripper)
+    assert robot.tree.prismatic.any()
+    assert robot.slides.tolist() == [False]
+    motion = vp.simulate(vp.Scene(robot, gravity=False), [1.0], [3.0], dt=1e-2, steps=40)
+    assert naming(motion.warnings, "1.5", "rad")
+
+
+def test_inspection_says_where_zero_is_outside_the_limits(gripper):
+    robot = vp.load_robot(gripper)
+    told = about(inspect_robot(robot).warnings, "outside limits")
+    assert len(told) == len(naming(told, "q = 0", "'turns'", "0.5", "1.5")) == 1
+    assert not about(inspect_robot(robot, q=[1.0]).warnings, "outside limits")
+
+
+def test_joints_locked_outside_their_limits_are_told_of(gripper, caplog):
+    with caplog.at_level(logging.WARNING):
+        vp.load_robot("panda", lock={"panda_joint4": -1.0})
+        assert not about(caplog.messages, "outside limits")
+        vp.load_robot("panda", lock={"panda_joint4": 1.0})
+    assert naming(caplog.messages, "lock['panda_joint4'] = 1", "limits", "-3.0718")

@@ -1,17 +1,22 @@
-"""The Lagrangian against a plain one and Pinocchio, and steps of large trees, solved from the leaves to the roots."""
+"""The Lagrangian against Pinocchio, and steps of large trees, solved from the leaves to the roots."""
 
 from __future__ import annotations
 
-import naive
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mechanisms import random_tree
-from oracles import slope
+from oracles import assert_jet, slope
+from refusals import refused
 
 import varpin as vp
+from varpin import textbook
 
 NAMES = ("Lq", "Lv", "Lqq", "Lvq", "Lvv")
 
@@ -27,31 +32,6 @@ def assert_close(actual: np.ndarray, expected: np.ndarray, rtol: float, what: st
     """Agreement to ``rtol`` of the largest entry, or of ``scale`` where everything might vanish."""
     scale = max(scale, np.abs(expected).max())
     np.testing.assert_allclose(actual, expected, rtol=0, atol=rtol * scale, err_msg=what)
-
-
-def naive_first(scene: vp.Scene, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """L_q and L_v at q, v (..., n) by complex step."""
-    n = scene.robot.dof
-    x = np.concatenate(np.broadcast_arrays(q, v), axis=-1)
-    g = naive.gradient(lambda y: naive.lagrangian(scene, y[..., :n], y[..., n:]), x)
-    return g[..., :n], g[..., n:]
-
-
-def check_against_naive(scene: vp.Scene, q: np.ndarray, v: np.ndarray, directions: np.ndarray, backend: str) -> None:
-    jet = vp.lagrangian_jet(scene, q, v, backend=backend)
-    kinetic = 0.5 * v @ jet.Lvv @ v
-    L = naive.lagrangian(scene, q, v)
-    assert abs(jet.L - L) <= 1e-13 * (abs(kinetic) + abs(kinetic - L)) * scene.robot.dof
-    Lq, Lv = naive_first(scene, q, v)
-    assert_close(jet.Lq, Lq, 1e-12, "Lq")
-    assert_close(jet.Lv, Lv, 1e-12, "Lv")
-    in_q = naive.directional(lambda x: np.stack(naive_first(scene, x, v), axis=1), q, directions)
-    in_v = naive.directional(lambda x: naive_first(scene, q, x)[1], v, directions)
-    # Two single joints side by side have no L_vq at all; differences then leave rounding of L_v.
-    momentum = np.abs(Lv).max()
-    assert_close(directions @ jet.Lqq, in_q[:, 0], 2e-11, "Lqq", momentum)
-    assert_close(directions @ jet.Lvq.T, in_q[:, 1], 2e-11, "Lvq", momentum)
-    assert_close(directions @ jet.Lvv, in_v, 2e-11, "Lvv")
 
 
 def test_compiled_is_what_pinocchio_computes(robot):
@@ -72,7 +52,7 @@ def test_random_trees(backend, seed, bodies, branching):
     robot = vp.load_robot(random_tree(seed, bodies, branching=branching))
     rng = np.random.default_rng(seed)
     q, v = rng.uniform(-3.0, 3.0, bodies), rng.normal(0.0, 2.0, bodies)
-    check_against_naive(busy_scene(robot, rng), q, v, np.eye(bodies), backend)
+    assert_jet(busy_scene(robot, rng), q, v, backend)
 
 
 @pytest.mark.parametrize("name", ["ur5", "xarm7", "allegro_left_hand"])
@@ -229,3 +209,150 @@ def test_long_chains_move_and_keep_their_energy(links):
     kinetic = 0.5 * motion.v[-1] @ motion.p[-1]
     assert turned <= 1e-4 * kinetic
     assert (motion.statistics.residual <= 100.0).all()
+
+
+# --- the textbook, which shares no code with the library -------------------------------------------------------------
+
+
+rng = np.random.default_rng(20)
+
+
+def pair(robot, *, noise=None, fields=textbook.no_noise, gravity=(0.0, 0.0, -9.81), **surroundings):
+    model = robot.model.copy()
+    model.gravity = pin.Motion(np.array(gravity), np.zeros(3))
+    scene = vp.Scene(robot, gravity=gravity, noise=noise, **surroundings)
+    return scene, textbook.system(model, fields=fields, **surroundings)
+
+
+@pytest.fixture(scope="module", params=["finger", "ur5", "chain"])
+def arm(request):
+    robot = vp.planar_chain(3) if request.param == "chain" else vp.load_robot(request.param)
+    n = robot.dof
+    return pair(robot, damping=np.linspace(0.0, 0.02, n), stiffness=np.linspace(0.3, 0.0, n), rest=0.2)
+
+
+@pytest.mark.parametrize("alpha", [0.5, 0.2])
+def test_motions_and_linearizations_are_those_of_the_textbook(arm, alpha):
+    scene, system = arm
+    # The finger's inertias are a millionth of the others': 0.1 ms are to it what 2 ms are to them.
+    n, N, h = scene.robot.dof, 20, 1e-4 if scene.robot.name == "finger" else 2e-3
+    q0, v0 = 0.3 * rng.normal(size=(2, n))
+    scale = np.abs(vp.lagrangian_jet(scene, q0, v0).Lq).max()
+    u = 0.1 * scale * rng.normal(size=(N, n))
+    ours = vp.simulate(scene, q0, v0, dt=h, steps=N, controls=u, integrator=vp.Midpoint(alpha), check=False)
+    assert ours.statistics.split_steps == 0
+    theirs = textbook.rollout(system, q0, v0, u, h, a=alpha)
+    assert np.abs(ours.q - theirs.q).max() <= 1e-11 * np.abs(theirs.q).max()
+    assert np.abs(ours.p - theirs.p).max() <= 1e-10 * np.abs(theirs.p).max()
+    lin = vp.linearize(scene, ours, integrator=vp.Midpoint(alpha))
+    for k in (0, N - 1):
+        own = textbook.linearize_step(system, theirs.q[k], theirs.q[k + 1], u[k], h, alpha)
+        for name in ("A", "B", "K"):
+            expected = getattr(own, name)
+            # Blocks of x = (q, p) have units of their own.
+            for part in (slice(0, n), slice(n, 2 * n)):
+                gap = np.abs(getattr(lin, name)[k][part] - expected[part]).max()
+                assert gap <= 1e-8 * np.abs(expected[part]).max(), (name, k)
+
+
+NOISES = {
+    "white": (vp.AdditiveNoise(1e-2), textbook.white_noise(1e-2)),
+    "control": (vp.ControlNoise(3e-2), textbook.control_noise(3e-2)),
+    "state": (vp.StateNoise(5e-2), textbook.state_noise(5e-2, np.array([0.4, 0.1, -0.2]))),
+}
+
+
+@pytest.mark.parametrize("name", NOISES)
+def test_noise_acts_as_in_the_textbook(name):
+    noise, fields = NOISES[name]
+    scene, system = pair(vp.planar_chain(3), noise=noise, fields=fields)
+    q0, h, N = np.array([0.4, 0.1, -0.2]), 5e-3, 20
+    u, dw = rng.normal(size=(N, 3)), np.sqrt(h) * rng.normal(size=(N, 3))
+    given = {"dt": h, "steps": N, "controls": u, "increments": dw, "integrator": vp.Midpoint()}
+    ours = vp.simulate(scene, q0, np.zeros(3), check=False, **given)
+    theirs = textbook.rollout(system, q0, np.zeros(3), u, h, dw=dw)
+    assert np.abs(ours.q - theirs.q).max() <= 1e-11
+    # What noise adds to a step, (1.7), against differences of the step itself.
+    own = textbook.linearize_step(system, *textbook.rollout(system, q0, np.zeros(3), u[:1], h).q, u[0], h)
+    for i in range(3):
+        e = 1e-2 * np.eye(3)[i]
+        ends = [np.concatenate(textbook.step(system, q0, np.zeros(3), u[0], h, dw=s * e)) for s in (1.0, -1.0)]
+        assert np.abs((ends[0] - ends[1]) / 2e-2 - own.K @ own.F[:, i]).max() <= 1e-7 * np.abs(own.K).max()
+
+
+@pytest.mark.parametrize("name", ["white", "control"])
+def test_a_plan_is_that_of_the_textbook(name):
+    noise, fields = NOISES[name]
+    scene, system = pair(vp.planar_chain(2), noise=noise, fields=fields, gravity=(0.0, 0.0, 0.0))
+
+    def reference(t):
+        return np.array([1.0 + 0.25 * np.sin(4 * np.pi * t), 0.1 * np.sin(2 * np.pi * t)])
+
+    h, N, q0 = 0.02, 40, np.array([0.8, 0.1])
+    plan = textbook.solve(system, textbook.TrackingCost(reference), q0, np.zeros(2), np.zeros((N, 2)), h)
+    cost = vp.TrackingCost(reference, 10.0) + vp.ControlCost(0.1) + vp.Terminal(vp.TrackingCost(reference))
+    problem = vp.OptimalControlProblem(
+        scene, cost, q0, np.zeros(2), dt=h, steps=N, integrator=vp.Midpoint(), sampling="start"
+    )
+    ours = vp.solve(problem, np.zeros(2), tolerance=1e-9)
+    assert ours.status.converged
+    assert ours.cost == pytest.approx(plan.cost, rel=1e-6)
+    assert ours.noise_cost == pytest.approx(plan.noise_cost, rel=1e-4)
+    assert np.abs(ours.controls - plan.motion.u).max() <= 1e-3 * np.abs(plan.motion.u).max()
+    assert np.abs(ours.gains - plan.policy.feedback).max() <= 1e-3 * np.abs(plan.policy.feedback).max()
+
+
+def test_models_of_joints_with_two_variables_are_refused():
+    model = pin.Model()
+    model.addJoint(0, pin.JointModelRUBZ(), pin.SE3.Identity(), "continuous")
+    with refused(vp.InputError, "variable"):
+        textbook.system(model)
+
+
+# --- sines, exponentials and tangents of the core: right to rounding, with and without FMA ---------------------------
+
+
+LINK = vp.Scene(vp.planar_chain(1))
+
+
+def gravity(q):
+    """The generalized force of gravity on a link that is horizontal at q = 0."""
+    return vp.lagrangian_jet(LINK, [q], [0.0]).Lq[0]
+
+
+def test_cosines_of_any_angle():
+    rng = np.random.default_rng(0)
+    sizes = 10.0 ** rng.uniform(-9.0, 6.0, 400)
+    angles = np.concatenate([sizes * rng.choice([-1.0, 1.0], 400), np.pi / 2 * np.arange(-20, 21), [0.0, 1.6e6, 1e9]])
+    largest = gravity(0.0)
+    expected = largest * np.cos(angles.astype(np.longdouble))
+    found = np.array([gravity(q) for q in angles])
+    np.testing.assert_allclose(found, expected.astype(float), rtol=4e-16, atol=1e-16 * abs(largest))
+
+
+RUN = """
+import hashlib
+import numpy as np
+import varpin as vp
+robot = vp.planar_chain(3)
+forces = [vp.CoulombFriction(0.4, width=0.1), vp.FrameSpring("tip", [1.0, 0.0, -1.0], 5.0, rotational_stiffness=2.0)]
+digest = hashlib.sha256()
+for integrator in (vp.Midpoint(), vp.Gauss(2), vp.RungeKutta4()):
+    motion = vp.simulate(
+        vp.Scene(robot, forces=forces), [0.3, -0.2, 2.9], [1.0, 2.0, -3.0], dt=0.01, steps=60, integrator=integrator
+    )
+    digest.update(motion.q.tobytes() + motion.p.tobytes())
+print(digest.hexdigest())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the switch is glibc's")
+def test_the_same_bytes_without_fused_multiplications():
+    """The C library takes other functions where the processor is said to have no FMA."""
+    bytes_of = [
+        subprocess.run(
+            [sys.executable, "-c", RUN], env=os.environ | tunables, capture_output=True, text=True, check=True
+        ).stdout
+        for tunables in ({}, {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-FMA,-FMA4,-AVX2,-AVX2_Usable,-FMA_Usable"})
+    ]
+    assert bytes_of[0] == bytes_of[1]

@@ -14,7 +14,6 @@ from scipy.optimize import fsolve
 
 import varpin as vp
 from varpin.model.chain import rod_chain
-from varpin.simulation.loop import unstable_loop
 
 KIND = "unstable loop"
 
@@ -70,7 +69,7 @@ def test_jury_conditions(kp, kd, period):
     options = {"dt": h / period, "steps": 150 * period, "period": period}
     motion = run(ROD, [0.3], [0.2 * (kp == 0)], pd(kp, kd), **options)
     assert bool(told(motion)) != stable, (size, motion.warnings)
-    for finding in unstable_loop(ROD, motion):
+    for finding in told(motion):
         assert (finding.kind, finding.joint) == (KIND, "joint1")
         np.testing.assert_allclose(finding.value, size, rtol=1e-6)
         assert naming([finding], f"{size:.4g}", "0.01 s")
@@ -136,7 +135,7 @@ def test_an_unstable_loop_that_clips_is_told(n, period, kp, kd, limit, gravity):
 
 def test_the_count_of_turns():
     motion = run(ROD, [0.0], [0.5], lambda t, q, v: -5.0 * np.sign(v), dt=1e-2, steps=300)
-    (finding,) = unstable_loop(ROD, motion)
+    (finding,) = told(motion)
     assert finding.value > 290
     assert 0.0 < finding.time < 0.3
     assert naming([finding], "joint1", f"{finding.value:.0f} times", "300 periods", "0.01 s")
@@ -200,6 +199,76 @@ def test_a_law_with_a_memory(kd, unstable):
         return -300.0 * (q - 1.0) - 100.0 * total - kd * v
 
     assert bool(told(run(PENDULUM, [0.0], [0.0], law, dt=1e-2, steps=300))) == unstable
+
+
+class Remembering:
+    """Springs and dampers of a rod on states that are late, filtered, or summed up, with the matrix of a period.
+
+    Its state is (q, v) and what the law remembers, about the goal 1 rad.
+    """
+
+    def __init__(self, kind, kp, kd, h):
+        self.kind, self.kp, self.kd, self.h = kind, kp, kd, h
+        self.late, self.slow, self.total = [], None, 0.0
+
+    def __call__(self, t, q, v):
+        if self.kind == "delay":
+            self.late = [*self.late, (q, v)][-3:]
+            q, v = self.late[0]
+        if self.kind == "filter":
+            self.slow = v if self.slow is None else self.slow + 0.3 * (v - self.slow)
+            v = self.slow
+        if self.kind == "integral":
+            self.total = self.total + self.h * (q - 1.0)
+        return -self.kp * (q - 1.0) - self.kd * v - 2.0 * self.kp * self.total
+
+    def radius(self):
+        h, zero = self.h, np.zeros((2, 2))
+        A, B = np.array([[1.0, h], [0.0, 1.0]]), np.array([[0.5 * h**2], [h]]) / INERTIA
+        K = -np.array([[self.kp, self.kd]])
+        if self.kind == "delay":
+            step = np.block([[A, zero, B @ K], [np.eye(2), zero, zero], [zero, np.eye(2), zero]])
+        elif self.kind == "filter":
+            new = np.array([[0.0, 0.3, 0.7]])
+            u = np.array([[-self.kp, 0.0, 0.0]]) - self.kd * new
+            step = np.vstack([np.hstack([A, np.zeros((2, 1))]) + B @ u, new])
+        else:
+            new = np.array([[h, 0.0, 1.0]])
+            u = np.append(K, [[0.0]], axis=1) - 2.0 * self.kp * new
+            step = np.vstack([np.hstack([A, np.zeros((2, 1))]) + B @ u, new])
+        return np.abs(np.linalg.eigvals(step)).max()
+
+
+@pytest.mark.parametrize("kind", ["delay", "filter", "integral"])
+@pytest.mark.parametrize("kd", [5.0, 15.0, 30.0, 60.0, 90.0, 200.0])
+def test_laws_that_remember(kind, kd):
+    law = Remembering(kind, 40.0, kd, 1e-2)
+    found = told(run(ROD, [0.9], [0.0], law, dt=1e-2, steps=100))
+    assert bool(found) == (law.radius() > 1.0), (law.radius(), found)
+    for finding in found:
+        np.testing.assert_allclose(finding.value, law.radius(), rtol=1e-6)
+
+
+@pytest.mark.parametrize("robot", ["ur5", "panda"])
+@pytest.mark.parametrize("encoder", ["noise", "quanta", "friction"])
+@pytest.mark.parametrize(("share", "unstable"), [(1.0, False), (2.5, True)])
+def test_encoders_are_no_feedback(robot, encoder, share, unstable):
+    """Dampers of a share of what the period allows, from encoders with noise or quanta, or with a small relay."""
+    scene, h, rng = vp.Scene(vp.load_robot(robot), damping=0.0), 2e-3, np.random.default_rng(1)
+    goal = np.resize([0.1, -0.9, 0.8, -1.2, 0.3, 0.9, 0.4], scene.robot.dof)
+    jet = vp.lagrangian_jet(scene, goal, 0.0 * goal)
+    M = np.diag(jet.Lvv)
+    kd = share * M / h / np.linalg.eigvals(np.linalg.solve(jet.Lvv, np.diag(M))).real.max()
+
+    def law(t, q, v):
+        relay = 0.02 * np.sign(v) if encoder == "friction" else 0.0
+        if encoder == "noise":
+            q, v = q + 1e-3 * rng.standard_normal(len(q)), v + 3e-2 * rng.standard_normal(len(q))
+        if encoder == "quanta":
+            q = 1e-3 * np.round(q / 1e-3)
+        return -jet.Lq - kd * (15.0 * (q - goal) + v + relay)
+
+    assert bool(told(run(scene, goal + 0.05 * unstable, 0.0 * goal, law, dt=h, steps=300))) == unstable
 
 
 @pytest.mark.parametrize(("kd", "unstable"), [(10.0, False), (60.0, True)])

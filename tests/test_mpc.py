@@ -5,7 +5,7 @@ import pytest
 from findings import about
 from mechanisms import slider
 from numpy.testing import assert_allclose, assert_array_equal
-from plan_problems import CAPSULES, TWO, swing, wave
+from plan_problems import TWO, swing, wave
 from refusals import naming, refused, unnamed
 
 import varpin as vp
@@ -284,11 +284,6 @@ def test_errors_of_steps_do_not_add_up_in_the_loop():
 # --- within constraints ----------------------------------------------------------------------------------------------
 
 
-def bob(t):
-    """Where a ball is that swings into the tool's way [m]."""
-    return [1.9 - 0.3 * np.sin(2.0 * t), 0.0, -1.35]
-
-
 def bounded(constraints, **options):
     cost = vp.TrackingCost(target, 100.0) + vp.ControlCost(1e-4) + vp.VelocityCost(1e-2)
     given = {"dt": 0.03, "steps": 16, "constraints": constraints, **options}
@@ -296,32 +291,6 @@ def bounded(constraints, **options):
 
 
 SPEEDS = [vp.WithinVelocityLimits(TWO, (-0.8, 0.8))]
-
-
-def round_things(time, swinging):
-    center = bob if swinging else bob(time)
-    ball = vp.Obstacle.sphere(bob(0.0 if swinging else time), 0.2)
-    ball = ball.moving(lambda t: bob(t) - np.array(bob(0.0))) if swinging else ball
-    return [vp.KeepOutOfSphere(TWO, "tip", center, 0.3), vp.KeepClear(TWO, [ball], 0.02, capsules=CAPSULES)]
-
-
-def test_obstacles_are_where_they_are_at_each_time():
-    problem = bounded(round_things(0.0, True), t0=0.4)
-    rng = np.random.default_rng(0)
-    q = rng.normal(size=(17, 2))
-    sphere, ball = (bound.value(q, q, q[1:]) for bound in problem.bound_constraints)
-    for k, t in enumerate(0.4 + 0.03 * np.arange(1, 17)):
-        still = bounded(round_things(t, False)).bound_constraints
-        for moving, there in zip((sphere, ball), still, strict=True):
-            assert_allclose(moving[k], there.value(q, q, q[1:])[k], rtol=0, atol=1e-12)
-    for bound in problem.bound_constraints:
-        slopes = bound.jacobian(q, q)
-        for c, e in enumerate(1e-6 * np.eye(2)):
-            found = (bound.value(q + e, q, q[1:]) - bound.value(q - e, q, q[1:])) / 2e-6
-            assert_allclose(slopes[:, :, c], found, rtol=0, atol=1e-7)
-    # Several motions at once, as a line search has them.
-    both = problem.bound_constraints[1].value(np.array([q, -q]), np.array([q, q]), np.zeros((2, 16, 2)))
-    assert_array_equal(both[0], ball)
 
 
 def test_ticks_that_find_no_plan_are_told_of():

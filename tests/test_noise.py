@@ -1,10 +1,16 @@
-"""Diffusion fields against their definitions, Wiener increments, and the order and laws of motions under noise."""
+"""Diffusion fields, Wiener increments, order and laws of motions under noise; noise that is held, or forgotten."""
+
+from __future__ import annotations
+
+import logging
 
 import numpy as np
 import pytest
-from mechanisms import slider
+from findings import about
+from mechanisms import crank_and_slider, slider
 from oracles import slope
-from refusals import refused
+from plan_problems import swing
+from refusals import naming, refused
 from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_lyapunov
 
 import varpin as vp
@@ -107,25 +113,6 @@ def test_state_noise_is_centred_on_the_start_of_the_motion():
         assert alone.p[k].tobytes() == paths.p[k].tobytes()
 
 
-@pytest.mark.parametrize(
-    ("make", "facts"),
-    [
-        (lambda: vp.AdditiveNoise([1.0, 2.0]), ("AdditiveNoise intensity", "(3,)", "(2,)")),
-        (lambda: vp.AdditiveNoise(np.ones((2, 4))), ("AdditiveNoise intensity", "(3, 4)", "(2, 4)")),
-        (lambda: vp.ControlNoise(np.ones((3, 4, 3))), ("ControlNoise intensity", "(3, 4, 2)")),
-        (lambda: vp.ControlNoise(np.full((3, 1, 2), np.nan)), ("ControlNoise intensity[0, 0, 0]", "nan")),
-        (lambda: 3.0, ("noise", "3.0")),
-        (lambda: [vp.AdditiveNoise(1.0), 0.5], ("noise", "0.5")),
-        (lambda: vp.CustomNoise(lambda q, v, u: np.eye(3), 3.0), ("CustomNoise processes", "3.0")),
-        (lambda: vp.CustomNoise(None, 3), ("CustomNoise field", "None")),
-        (lambda: vp.CustomNoise(lambda q, v, u: np.eye(3), 3, dv=0.0), "CustomNoise dv"),
-    ],
-)
-def test_parameters_that_do_not_fit(make, facts):
-    with refused(vp.InputError, facts):
-        vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=make())
-
-
 @pytest.mark.parametrize("left_out", [False, True])
 @pytest.mark.parametrize("wrong", ["dq", "dv", "du"])
 def test_a_wrong_or_missing_derivative_is_named(wrong, left_out):
@@ -206,18 +193,6 @@ def test_a_field_cannot_reach_into_the_motion():
     assert motions[0].u.tobytes() == motions[1].u.tobytes()
 
 
-@pytest.mark.parametrize("kick", ["left", "split"])
-def test_python_and_compiled_fields_give_the_same_motion(kick):
-    added, state = vp.AdditiveNoise(0.2), vp.StateNoise(0.7, center=[0.5, 0.0])
-    own = vp.CustomNoise(lambda q, v, u: np.diag(0.7 * (q - [0.5, 0.0]) ** 2), 2)
-    options = {"dt": 0.01, "steps": 200, "rng": 1, "integrator": vp.Midpoint(kick=kick)}
-    scenes = [chain(added + part) for part in (state, own)]
-    one, other = (vp.simulate(scene, [0.3, 0.2], [0, 1], **options) for scene in scenes)
-    assert other.dw.tobytes() == one.dw.tobytes()
-    for name in ("q", "v", "p", "energy"):
-        np.testing.assert_allclose(getattr(other, name), getattr(one, name), rtol=0, atol=1e-10)
-
-
 @pytest.mark.parametrize(
     "integrator", [vp.Midpoint(), vp.Midpoint(kick="split"), vp.Midpoint(kick="held"), vp.Radau(2)]
 )
@@ -286,20 +261,6 @@ def test_coarse_increments_are_sums(factor):
     dw = np.arange(12.0).reshape(6, 2) ** 2
     sums = [[sum(dw[k * factor + i, c] for i in range(factor)) for c in range(2)] for k in range(6 // factor)]
     np.testing.assert_array_equal(coarsen(dw, factor), sums)
-
-
-@pytest.mark.parametrize(
-    ("call", "facts"),
-    [
-        (lambda: coarsen(np.zeros((9, 1)), 2), ("number", "9", "2")),
-        (lambda: coarsen(np.zeros(8)), ("increments", "(8,)")),
-        (lambda: wiener_increments(2, 0.1, 3, increments=np.zeros((3, 1))), ("(3, 2)", "(3, 1)")),
-        (lambda: wiener_increments(1, 0.1, 1, 0, np.zeros((1, 1))), ("rng", "increments")),
-    ],
-)
-def test_errors(call, facts):
-    with refused(vp.InputError, facts):
-        call()
 
 
 NOISES = {
@@ -392,3 +353,204 @@ def test_weak_order_of_the_mean_energy(kick, order, coarse):
         errors.append(abs(energy[0] - energy[1]))
     slopes = np.log2(np.divide(errors[:-1], errors[1:]))
     assert (np.abs(slopes - order) < 0.1).all(), (slopes, errors)
+
+
+# --- held over a step: a control of the step, deviations of velocities, drives at their limits -----------------------
+
+
+HELD = [vp.Midpoint(kick="held"), vp.Gauss(2, kick="held"), vp.Radau(2, kick="held")]
+
+
+@pytest.mark.parametrize("servo", [False, True])
+@pytest.mark.parametrize("kind", [vp.Midpoint, vp.Gauss, vp.Radau])
+@pytest.mark.parametrize("guard", [None, vp.Guard(branch_margin=0.9, energy_balance=1e-6)], ids=["whole", "divided"])
+def test_the_force_acts_like_a_control_of_the_step(kind, guard, servo):
+    robot = vp.planar_chain(2)
+    integrator = kind(guard=guard, kick="held")
+    start = {"q0": [1.0, 0.5], "v0": [2.0, -9.0], "dt": 0.1, "steps": 8, "integrator": integrator, "check": False}
+    noisy = servoed(0.5) if servo else vp.Scene(robot, damping=0.1, noise=vp.AdditiveNoise([0.3, 0.2]))
+    motion = vp.simulate(noisy, **start, controls=np.tile([90.0 if servo else 0.5, 0.4], (8, 1)), rng=0)
+    # The servo's drive is at its limit.
+    forces = np.array([0.5, 0.4]) + motion.dw * [0.3, 0.2] / 0.1
+    same = vp.simulate(vp.Scene(robot, damping=0.1), **start, controls=forces)
+    assert (motion.statistics.split_steps > 0) == (guard is not None)
+    for name in ("q", "p", "energy"):
+        np.testing.assert_allclose(getattr(motion, name), getattr(same, name), rtol=0, atol=1e-10 if servo else 1e-12)
+    np.testing.assert_allclose(
+        motion.statistics.energy_defect,
+        same.statistics.energy_defect,
+        rtol=0,
+        atol=1e-10 * np.abs(same.energy).max(),
+    )
+
+
+OF_VELOCITIES = [
+    *(vp.Midpoint(alpha, kick=kick) for alpha in (0.5, 0.3) for kick in ("left", "split", "held")),
+    *(kind(kick=kick) for kind in (vp.Gauss, vp.Radau) for kick in ("left", "split", "held")),
+    *(vp.RungeKutta4(), vp.SemiImplicitEuler(), vp.ExplicitEuler()),
+]
+
+
+@pytest.mark.parametrize("integrator", OF_VELOCITIES, ids=str)
+@pytest.mark.parametrize("rate", [0.01, 0.17, 0.26, 0.9, 1.9, 20.0])
+def test_a_damped_velocity_has_its_stationary_deviation_or_a_warning(integrator, rate):
+    """An Ornstein-Uhlenbeck joint, s / sqrt(2 d I) in equilibrium: told from a tenth on."""
+    inertia, s, dt = 1.0 / 3.0, 0.3, 0.01
+    damping = rate * inertia / dt
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=damping, noise=vp.AdditiveNoise(s))
+    run = {"dt": dt, "steps": 300, "integrator": integrator}
+    if rate > 2.0 and not integrator.variational:
+        pytest.skip("unstable")
+    quiet = vp.simulate(scene, [0.0], [0.0], increments=0, check=False, **run)
+    moments = vp.propagate_moments(vp.linearize(scene, quiet))
+    deviation = np.sqrt(moments.covariance[-1, 1, 1]) / (inertia if integrator.variational else 1.0)
+    true = s / np.sqrt(2.0 * damping * inertia) * np.sqrt(-np.expm1(-2.0 * rate * 300))
+    paths = vp.simulate_ensemble(scene, [0.0], [0.0], paths=2, rng=0, **run)
+    for told in (moments.warnings, paths.warnings, vp.simulate(scene, [0.0], [0.0], rng=0, **run).warnings):
+        found = about(told, "noise of velocities")
+        assert bool(found) == (abs(deviation / true - 1.0) > 0.1)
+        assert all(abs(each.value - deviation / true) < 1e-3 * each.value for each in found)
+        assert all(naming([each], "joint1", f"{deviation / true:.2g}") for each in found)
+    assert not vp.simulate(scene, [0.0], [0.0], increments=0, **run).warnings
+
+
+@pytest.mark.parametrize(
+    ("damping", "noise", "held", "told"),
+    [([1e3, 1e3, 0], [0, 0, 1], None, False), ([0, 0, 1e3], [1, 1, 0], None, False),
+     ([0, 0, 0], [1, 1, 1], None, False), ([0, 0, 1e3], [0, 0, 1], None, True), ([0, 0, 1e3], [1] * 3, "block", False)],
+)  # fmt: skip
+def test_only_damped_joints_that_noise_moves_have_wrong_deviations(damping, noise, held, told):
+    inputs = vp.KinematicInput(held) if held else ()
+    scene = vp.Scene(
+        crank_and_slider(), gravity=False, damping=damping, constraints=inputs, noise=vp.AdditiveNoise(noise)
+    )
+    run = {"dt": 0.01, "steps": 30, "integrator": vp.Gauss(2, kick="held"), "rng": 0}
+    motion = vp.simulate(scene, np.zeros(3), np.zeros(3), **run)
+    assert len(about(motion.warnings, "noise of velocities")) == told
+
+
+SERVO = (40.0, 3.0)
+
+
+def servoed(limit, **more):
+    servo = vp.PositionServo(*({"joint1": value} for value in (*SERVO, limit)))
+    return vp.Scene(vp.planar_chain(2), damping=0.1, forces=[servo], noise=vp.AdditiveNoise([0.3, 0.2]), **more)
+
+
+@pytest.mark.parametrize("kick", ["held", None])
+def test_drives_at_their_limits_do_not_cut_noise_off(kick):
+    """A mass under noise far above what its drive has: its velocity is that of the impulses."""
+    mass, strength = 2.0, 3.0
+    servo = vp.PositionServo(1e-9, 1e-9, 0.1)
+    scene = vp.Scene(slider(mass), gravity=False, forces=[servo], noise=vp.AdditiveNoise(strength))
+    given = {} if kick is None else {"integrator": vp.Midpoint(kick=kick)}
+    motion = vp.simulate(scene, [0.0], [0.0], dt=0.01, steps=50, rng=0, **given)
+    np.testing.assert_allclose(motion.v[-1], strength * motion.dw.sum(axis=0) / mass, rtol=1e-6)
+    problem = vp.OptimalControlProblem(scene, vp.ControlCost(1.0), [0.0], [0.0], dt=0.1, steps=2)
+    assert problem.integrator.kick == "held"
+
+
+@pytest.mark.parametrize("integrator", HELD, ids=str)
+@pytest.mark.parametrize("command", [0.2, 0.45, 0.9], ids=["free", "bent", "saturated"])
+@pytest.mark.parametrize("constraints", [(), [vp.JointTie("joint2", "joint1")]], ids=["single", "tied"])
+def test_derivatives_beside_a_limited_drive(integrator, command, constraints):
+    if constraints and isinstance(integrator, vp.Radau):
+        pytest.skip("Radau's methods keep no constraints")
+    scene, n = servoed(10.0, constraints=constraints), 2
+    q, v = np.array([0.2, 0.2]), np.array([0.1, 0.1])
+    u = np.array([command, 0.5])
+    options = {"dt": 0.02, "steps": 1, "integrator": integrator, "check": False}
+
+    def end(du, dw):
+        motion = vp.simulate(scene, q, v, controls=(u + du)[None], increments=dw[None], **options)
+        return np.concatenate([motion.q[-1], motion.p[-1]])
+
+    lin = vp.linearize(scene, vp.simulate(scene, q, v, controls=u[None], increments=0, **options))
+    none = np.zeros(n)
+    for own, moved in ((lin.G[0], lambda z: end(none, z)), (lin.B[0], lambda z: end(z, none))):
+        expected = np.transpose([slope(moved, none, e, 1e-4) for e in np.eye(n)])
+        np.testing.assert_allclose(own, expected, rtol=0, atol=2e-7 * np.abs(expected).max())
+    assert np.abs(lin.G[0, n:, 0]).max() > 0.05
+    # The demand at the start is 0, 0.97 and 2.77 times the limit.
+    assert (np.abs(lin.B[0, :, 0]).max() < 1e-12) == (command == 0.9)
+
+
+# --- not drawn, and seeds of nothing: told of, unless either is meant ------------------------------------------------
+
+
+CHAIN = vp.planar_chain(2)
+QUIET = vp.Scene(CHAIN)
+FORGOTTEN = {
+    "additive": vp.AdditiveNoise(1e-3),
+    "control": vp.ControlNoise(1e-3),
+    "custom": vp.CustomNoise(lambda q, v, u: 1e-3 * np.eye(2), processes=2),
+}
+SHORT = {"dt": 1e-3, "steps": 20}
+
+
+def noisy(noise="additive"):
+    return vp.Scene(CHAIN, noise=FORGOTTEN[noise])
+
+
+@pytest.mark.parametrize("check", [True, False])
+@pytest.mark.parametrize("noise", FORGOTTEN)
+def test_noise_that_is_not_drawn_is_told_of_once(noise, check, caplog):
+    scene = noisy(noise)
+    with caplog.at_level(logging.WARNING):
+        motions = [vp.simulate(scene, [0, 0], [0, 0], **SHORT, check=check) for _ in range(3)]
+    for motion in motions:
+        assert len(motion.warnings) == len(about(motion.warnings, "noise not drawn")) == 1
+        assert not motion.dw.any()
+    assert len(about(caplog.messages, "noise not drawn")) == 1
+
+
+@pytest.mark.parametrize("meant", [{"rng": 0}, {"increments": 0}, {"increments": np.zeros((20, 2))}], ids=str)
+def test_what_is_meant_is_not_told_of(meant):
+    assert vp.simulate(noisy(), [0, 0], [0, 0], **SHORT, **meant).warnings == ()
+
+
+def test_no_increments_are_the_motion_without_noise():
+    quiet = vp.simulate(QUIET, [0.1, 0.2], [0, 0], **SHORT)
+    told = vp.simulate(noisy(), [0.1, 0.2], [0, 0], **SHORT, increments=0)
+    np.testing.assert_allclose(told.q, quiet.q, rtol=0.0, atol=1e-14)
+    with refused(vp.InputError, "increments", "(20, 2)"):
+        vp.simulate(noisy(), [0.1, 0.2], [0, 0], **SHORT, increments=1.0)
+
+
+def test_paths_that_are_all_one_and_seeds_of_nothing_are_told_of():
+    alone = vp.simulate(QUIET, [0, 0], [0, 0], **SHORT, rng=0).warnings
+    assert len(alone) == len(about(alone, "nothing random")) == 1
+    starts = [[0.0, 0.0], [0.1, 0.0], [0.2, 0.0]]
+    for scene, q0, paths in ((QUIET, [0, 0], 3), (QUIET, starts, 3), (noisy(), [0, 0], 3), (QUIET, [0, 0], 1)):
+        told = vp.simulate_ensemble(scene, q0, [0, 0], **SHORT, paths=paths, rng=0).warnings
+        same = scene is QUIET and paths > 1 and q0 is not starts
+        assert len(told) == len(about(told, "paths alike")) == same
+
+
+def problem(scene):
+    return swing(scene=scene, steps=5)
+
+
+def test_a_controller_tells_of_its_plant():
+    mpc = vp.Mpc(problem(noisy()))
+    for plant, rng, said in (
+        (None, None, "noise not drawn"),
+        (None, 0, None),
+        (vp.Plant(noisy()), None, "noise not drawn"),
+        (vp.Plant(QUIET), 0, "nothing random"),
+        (vp.Plant(QUIET), None, None),
+    ):
+        run = mpc.run(plant, duration=0.06, rng=rng)
+        told = about(run.warnings, "noise not drawn", "nothing random")
+        assert len(told) == (said is not None)
+        assert not told or about(told, said)
+        assert not about(run.motion.warnings[1:], "noise not drawn", "nothing random")
+
+
+def test_plans_and_their_checks_draw_nothing_and_say_nothing(caplog):
+    with caplog.at_level(logging.WARNING):
+        plan = vp.solve(problem(noisy()), max_iterations=2)
+        plan.problem.simulate(plan.policy)
+        plan.verify(tolerance=1e-3)
+        vp.check_linearization(noisy(), [0.1, 0.2], [0.0, 0.0], dt=1e-2)
+    assert not about(caplog.messages, "noise not drawn")

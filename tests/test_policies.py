@@ -1,10 +1,12 @@
-"""Laws and policies that act once a period, in finer steps too, and controls by joint name."""
+"""Laws and policies that act once a period, controls by joint name, and what changes of controls cost."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from oracles import rollout, slope
+from plan_problems import linear, sliders
 from refusals import refused
 
 import varpin as vp
@@ -42,15 +44,6 @@ def test_a_policy_with_a_period_is_held_over_finer_steps(finer):
         assert_allclose(motion.u[finer * k], given.control(k, x), rtol=1e-12, atol=1e-12)
     assert_array_equal(motion.q, run(policy(hold=finer, period=None), dt, INTERVALS * finer).q)
     assert_allclose(run(motion.u, dt, INTERVALS * finer).q, motion.q, rtol=0.0, atol=1e-13)
-
-
-def test_ensembles_hold_it_alike():
-    motion = run(policy(), PERIOD / 4, 4 * INTERVALS)
-    paths = vp.simulate_ensemble(
-        SCENE, [Q0, Q0], REST, dt=PERIOD / 4, steps=4 * INTERVALS, paths=2, rng=0, controls=policy(),
-        integrator=vp.RungeKutta4(),
-    )  # fmt: skip
-    assert_array_equal(paths.u[1], motion.u)
 
 
 def test_a_plan_runs_at_finer_steps_as_it_is():
@@ -156,3 +149,284 @@ def test_noise_that_python_evaluates_keeps_the_period():
         given = {"dt": 1e-2, "steps": 17, "controls": lambda t, q, v: -10.0 * q - v, "period": 5, "rng": 3}
         motions.append(vp.simulate(vp.Scene(CHAIN, noise=noise), Q0, REST, **given))
     assert_allclose(motions[0].u, motions[1].u, atol=1e-12)
+
+
+# --- the cost of changing controls, and what hands the control before on ---------------------------------------------
+
+
+MATRIX = np.array([[2e-2, 5e-3], [5e-3, 1e-2]])
+BEFORE = np.array([0.7, -0.3])
+
+
+def plain_rate(u, weight, before, period):
+    W = np.asarray(weight) * np.eye(u.shape[1]) if np.ndim(weight) < 2 else np.asarray(weight)
+    total, last = 0.0, before
+    for row in u:
+        if last is not None:
+            total += (row - last) @ W @ (row - last) / period
+        last = row
+    return total
+
+
+@pytest.mark.parametrize("hold", [1, 3])
+@pytest.mark.parametrize("before", [None, BEFORE], ids=["free", "given"])
+@pytest.mark.parametrize("weight", [0.3, [0.3, 0.1], MATRIX], ids=["number", "vector", "matrix"])
+def test_value(weight, before, hold):
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(24 // hold, 2))
+    bare, rated = linear(hold=hold), linear(vp.ControlRateCost(weight, before), hold=hold)
+    motion = rollout(bare, u)
+    expected = plain_rate(u, weight, before, 0.05 * hold)
+    assert rated.cost_of(motion) - bare.cost_of(motion) == pytest.approx(expected, rel=1e-11)
+    # Scaled and summed, and of many motions at once.
+    half = vp.ControlRateCost(np.multiply(0.25, weight), before)
+    parts = linear(2.0 * (half + 0.0 * vp.VelocityCost()) + 0.5 * vp.ControlRateCost(weight, before), hold=hold)
+    assert parts.cost_of(motion) == pytest.approx(rated.cost_of(motion), rel=1e-12)
+    many = [np.repeat(array[None], 3, axis=0) for array in (motion.q, motion.v, motion.u)]
+    assert_allclose(rated.costs(*many), rated.cost_of(motion), rtol=1e-12)
+
+
+def random_policy(scene, steps, hold=1, before=None, limits=None):
+    rng = np.random.default_rng(5)
+    n, m = scene.robot.dof, scene.controls
+    return vp.LinearPolicy(
+        rng.normal(size=(steps, m)), -0.3 * rng.random(size=(steps, m, 2 * n)), rng.normal(size=(steps, 2 * n)), hold,
+        limits=limits, previous_gains=0.4 * rng.normal(size=(steps, m, m)), previous=rng.normal(size=(steps, m)),
+        before=before,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("before", [None, BEFORE], ids=["free", "given"])
+@pytest.mark.parametrize("limits", [None, (-0.8, 0.8)], ids=["free", "limited"])
+@pytest.mark.parametrize(
+    "integrator",
+    [vp.Midpoint(), vp.Gauss(2), vp.RungeKutta4(), vp.SemiImplicitEuler(), vp.ExplicitEuler(), vp.Reference()],
+    ids=str,
+)
+def test_policies_feed_the_control_before_back(monkeypatch, integrator, limits, before):
+    monkeypatch.setattr("varpin.simulation.simulate._CHUNK", 8)
+    scene = vp.Scene(sliders(2), gravity=False, damping=0.3)
+    policy = random_policy(scene, 10, 2, before, limits)
+    motion = vp.simulate(scene, [0.3, -0.4], [0.5, 0.1], dt=0.05, steps=20, controls=policy, integrator=integrator)
+    x = np.hstack([motion.q, motion.p if integrator.variational else motion.v])
+    last = before
+    assert ((motion.u == -0.8) | (motion.u == 0.8)).any() == (limits is not None)
+    for k in range(10):
+        u = policy.u[k] + policy.gains[k] @ (x[2 * k] - policy.reference[k])
+        if last is not None:
+            u = u + policy.previous_gains[k] @ (last - policy.previous[k])
+        u = np.clip(u, -0.8, 0.8) if limits else u
+        assert_allclose(motion.u[2 * k : 2 * k + 2], [u, u], rtol=0, atol=1e-12)
+        assert_array_equal(policy.control(k, x[2 * k], last), u)
+        last = motion.u[2 * k]
+
+
+def test_feedback_on_another_start_and_another_control_before():
+    """On a linear system the law is the optimum wherever it starts: shifted, with what acted before."""
+    problem = linear(vp.ControlRateCost(MATRIX), sampling="start", hold=2)
+    whole = vp.solve(problem, tolerance=1e-15)
+    motion, j = whole.trajectory, 8
+    applied = whole.controls[3] + [0.5, -0.4]
+    later = problem.at(q0=motion.q[j] + 0.1, v0=motion.v[j] - 0.2, steps=24 - j, t0=problem.dt * j, before=applied)
+    own = whole.shifted(4, applied)
+    rows = slice(0, 8)
+    policy = vp.LinearPolicy(
+        own.u[rows], own.gains[rows], own.reference[rows], own.hold, previous_gains=own.previous_gains[rows],
+        previous=own.previous[rows], before=own.before,
+    )  # fmt: skip
+    best = vp.solve(later, tolerance=1e-15)
+    assert_allclose(later.simulate(policy).u[::2], best.controls, rtol=0, atol=1e-6)
+    # What is repeated at the end expects itself before, so that it goes on where nothing is off.
+    assert_array_equal(own.previous[9:], own.u[8:-1])
+
+
+def test_mpc_joins_its_plans():
+    for before in (BEFORE, None):
+        problem = linear(vp.ControlRateCost(0.1, before), q0=(0.0, 0.0))
+        robot, actuation = problem.scene.robot, problem.scene.actuation
+        noisy = vp.Scene(robot, gravity=False, noise=vp.AdditiveNoise(0.5), damping=0.2, actuation=actuation)
+        run = vp.Mpc(problem).run(vp.Plant(noisy), duration=1.0, rng=1)
+        given = [plan.problem.rate.before for plan in run.plans]
+        assert given[0] is None if before is None else (given[0] == before).all()
+        assert_array_equal(given[1:], run.motion.u[::10][: len(given) - 1])
+    again = vp.Mpc(problem).plan(0.1, [0.1, 0.1], [0.0, 0.0], run.plans[0], decisions=2)
+    assert_array_equal(again.problem.rate.before, run.plans[0].controls[1])
+
+
+def test_sums_scales_and_words():
+    own = vp.ControlRateCost(2.0)
+    assert own.of_controls
+    assert repr(0.5 * own + vp.ControlCost()) == "0.5 * ControlRateCost(weight=2.0) + ControlCost(weight=1.0)"
+    assert repr(vp.ControlRateCost([1.0, 2.0], 0.5)) == "ControlRateCost(weight=[1.0, 2.0], before=0.5)"
+    assert_array_equal(linear(vp.ControlRateCost(1.0, 0.5)).rate.before, [0.5, 0.5])
+    assert_array_equal(linear(2.0 * own + vp.ControlRateCost([1.0, 3.0])).rate.weight, np.diag([5.0, 7.0]))
+
+
+# --- that change within a step: their values and means, steps in parts, functions of time ----------------------------
+
+
+UR5_Q = np.array([0.3, -1.2, 0.8, 0.2, 0.5, -0.3])
+
+
+def force(t):
+    return np.array([40.0, 60.0, 30.0, 5.0, 4.0, 3.0]) * np.sin(np.arange(3.0, 9.0) * t + np.arange(6))
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return vp.Scene(vp.load_robot("ur5"))
+
+
+def moments(force, begin, dt):
+    """The moments of a function over a step by Legendre's polynomials of degree 0 to 3, and 40 points."""
+    x, w = np.polynomial.legendre.leggauss(40)
+    values = np.array([force(begin + 0.5 * dt * (1.0 + at)) for at in x])
+    return 0.5 * np.polynomial.legendre.legvander(x, 3).T @ (w[:, None] * values)
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(1), vp.Radau(1), vp.ExplicitEuler()], ids=str)
+def test_one_stage_holds_the_mean(arm, integrator):
+    motion = vp.simulate(arm, UR5_Q, np.zeros(6), dt=0.01, steps=5, controls=vp.OpenLoop(force), integrator=integrator)
+    assert_allclose(motion.u, [moments(force, 0.01 * k, 0.01)[0] for k in range(5)], rtol=1e-13)
+    assert motion.u_stages.shape == (5, 0, 6)
+
+
+@pytest.mark.parametrize("integrator", [vp.Gauss(3), vp.Radau(2), vp.RungeKutta4()], ids=str)
+def test_values_and_means(arm, integrator):
+    motion = vp.simulate(arm, UR5_Q, np.zeros(6), dt=0.01, steps=6, controls=vp.OpenLoop(force), integrator=integrator)
+    times = 2.0 * np.array(integrator.stage_times) - 1.0
+    for k in range(6):
+        of_force = moments(force, 0.01 * k, 0.01)[: len(times)]
+        through = np.polynomial.legendre.legfit(times, motion.u_stages[k], len(times) - 1)
+        own = through / (2.0 * np.arange(len(times)) + 1.0)[:, None]
+        assert_allclose(own, of_force, rtol=0, atol=1e-12 * np.abs(of_force).max())
+        assert_allclose(motion.u[k], of_force[0], rtol=1e-12)
+    assert motion.part(2, 5).u_stages.shape == (3, len(times), 6)
+
+
+def stiff_scene():
+    robot = vp.planar_chain(3)
+    names = robot.joint_names
+    return vp.Scene(
+        robot,
+        damping=0.3,
+        forces=[
+            vp.PositionServo({names[1]: 40.0}, damping=1.0, effort=25.0),
+            vp.CoulombFriction({names[0]: 0.4}, width=3.0),
+        ],
+    )
+
+
+SMALL = {"dt": 0.03, "steps": 3}
+CHAIN_Q, CHAIN_V = np.array([0.3, -0.4, 0.5]), np.array([1.0, -0.5, 0.8])
+
+
+def push(t):
+    return np.array([3.0 * np.sin(9.0 * t + 1.0), 0.2 + 0.02 * np.sin(7.0 * t), np.sin(5.0 * t + 1.0)])
+
+
+@pytest.mark.parametrize(("stages", "balance"), [(2, 1e-3), (3, 1e-7)])
+def test_derivatives_of_steps_in_parts_against_differences(stages, balance):
+    scene, integrator = stiff_scene(), vp.Gauss(stages, guard=vp.Guard(energy_balance=balance))
+    n, dt = 3, SMALL["dt"]
+    motion = vp.simulate(scene, CHAIN_Q, CHAIN_V, controls=vp.OpenLoop(push), integrator=integrator, **SMALL)
+    assert motion.statistics.split_steps > 0
+    lin = vp.linearize(scene, motion)
+    for k in range(motion.steps):
+
+        def end(z, k=k):
+            q, p, shift, ramp = motion.q[k] + z[:n], motion.p[k] + z[n : 2 * n], z[2 * n : 3 * n], z[3 * n :]
+            v = np.linalg.solve(vp.lagrangian_jet(scene, q, np.zeros(n)).Lvv, p)
+            force = vp.OpenLoop(lambda t: push(k * dt + t) + shift + ramp * t / dt)
+            own = vp.simulate(scene, q, v, dt=dt, steps=1, controls=force, integrator=integrator, check=False)
+            assert own.statistics.substeps[0] == motion.statistics.substeps[k], "the difference crosses a guard"
+            return np.concatenate([own.q[1], own.p[1]])
+
+        given = np.hstack([lin.A[k], lin.B[k], lin.ramp[k]])
+        for c, e in enumerate(np.eye(4 * n)):
+            found = slope(end, np.zeros(4 * n), e, 4e-5 if c < 2 * n else 4e-4)
+            assert_allclose(given[:, c], found, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(("stages", "balance"), [(2, 1e-10), (3, 1e-13)])
+def test_steps_in_parts_keep_the_order(stages, balance):
+    scene = vp.Scene(vp.planar_chain(3))
+    options = {"duration": 0.48, "controls": vp.OpenLoop(push), "check": False}
+    end = vp.simulate(scene, CHAIN_Q, CHAIN_V, steps=96, integrator=vp.Gauss(5), **options).q[-1]
+    cut, errors = vp.Gauss(stages, guard=vp.Guard(energy_balance=balance)), []
+    for steps in (6, 12):
+        motion = vp.simulate(scene, CHAIN_Q, CHAIN_V, steps=steps, integrator=cut, **options)
+        assert motion.statistics.split_steps == steps
+        errors.append(np.abs(motion.q[-1] - end).max())
+        whole = vp.simulate(scene, CHAIN_Q, CHAIN_V, steps=steps, integrator=vp.Gauss(stages), **options)
+        assert errors[-1] < 0.5 * np.abs(whole.q[-1] - end).max()
+    assert np.log2(errors[0] / errors[1]) > 2 * stages - 0.5, errors
+
+
+RISE = np.array([0.5, -0.2, 0.1])
+
+
+def rising(t):
+    t = np.asarray(t)[..., None]
+    return RISE * (1.0 + 2.0 * t * t)
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(3), vp.Radau(2), vp.RungeKutta4()])
+def test_a_function_of_many_times_makes_the_motion_of_one_of_each(integrator):
+    scene, called = vp.Scene(vp.planar_chain(3)), []
+
+    def plain(t):
+        assert isinstance(t, float)
+        called.append(t)
+        return rising(t)
+
+    def lists(t):
+        return rising(t).tolist()
+
+    def vectorized(t):
+        assert t.ndim == 1
+        called.append(t)
+        return rising(t)
+
+    options = {"dt": 0.01, "steps": 7, "integrator": integrator}
+    motion = vp.simulate(scene, CHAIN_Q, CHAIN_V, controls=vp.OpenLoop(plain), check=False, **options)
+    assert called == sorted(set(called)), "a time is asked for twice, or before an earlier one"
+    called.clear()
+    for controls in (vp.OpenLoop(lists), vp.OpenLoop(vectorized, vectorized=True)):
+        again = vp.simulate(scene, CHAIN_Q, CHAIN_V, controls=controls, **options)
+        assert_array_equal(again.u, motion.u)
+        assert_array_equal(again.q, motion.q)
+    # For the motion, for its means, and for its repetition: the first time of each is alone.
+    assert len(called) <= 6
+
+
+def test_where_a_function_of_many_times_fails():
+    scene = vp.Scene(vp.planar_chain(3))
+    options = {"dt": 0.01, "steps": 7, "integrator": vp.Gauss(2)}
+    at = float(3 + vp.Gauss(2).stage_times[1]) * 0.01
+
+    def failed(f, *facts):
+        with refused(vp.ControlError, facts) as info:
+            vp.simulate(scene, CHAIN_Q, CHAIN_V, controls=vp.OpenLoop(f, vectorized=True), **options)
+        return info.value
+
+    def raises(t):
+        if (t >= at).any():
+            raise RuntimeError("no more")
+        return rising(t)
+
+    for f, words in (
+        (raises, "RuntimeError"),
+        (lambda t: np.where((t >= at)[:, None], np.nan, rising(t)), "[0, 0]"),
+    ):
+        error = failed(f, words)
+        assert (error.step, error.trajectory.steps) == (3, 3)
+        assert at <= error.time < 0.04
+    assert failed(lambda t: rising(t).T, "(1, 3)", "(3, 1)").step == 0
+    assert failed(lambda t: rising(t[0]), "(1, 3)", "(3,)").step == 0
+    failed(lambda t: rising(t)[:3], "times")
+    with refused(vp.InputError, "vectorized"):
+        vp.OpenLoop(rising, vectorized="no")
+    # As many times as controls: rows and columns look alike.
+    options["steps"] = 2
+    failed(lambda t: rising(t).T, "(1, 3)", "(3, 1)")

@@ -1,22 +1,44 @@
 """Replays in real, headless Chromium, cut off from the network."""
 
+import contextlib
+import importlib.util
+import itertools
 import logging
 import re
+import shutil
+import time
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
-from chromium import animation, commands, connect, picture, seek, severe, shape_poses, shapes_stand, visit, wait_until
+from chromium import (
+    animation,
+    commands,
+    connect,
+    names,
+    picture,
+    seek,
+    severe,
+    shape_poses,
+    shapes_stand,
+    visit,
+    wait_until,
+)
 from mechanisms import joint, link, write_urdf
-from refusals import naming, refused
+from PIL import Image, ImageSequence
+from refusals import naming, refused, unnamed
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
 
 import varpin as vp
 from varpin import replay
+from varpin.cli import main
+from varpin.model import geometry
+from varpin.show.replay import live, page, video
 from varpin.show.replay import page as page_module
 from varpin.show.replay import shapes as shape_module
-from varpin.show.replay.picture import Picture
+from varpin.show.replay.picture import Picture, labels
 
 
 @pytest.fixture(scope="module")
@@ -362,3 +384,392 @@ def test_all_of_the_motion_is_in_view_above_the_bar(show, browser, size):
         browser.set_window_size(800, 600)
     told = [entry["message"] for entry in browser.get_log("browser")]
     assert not [words for words in told if "deprecated" in words]
+
+
+# --- looks of shapes: colours of mesh files, textures, and a node of its own for each --------------------------------
+
+
+CORNERS = [f"v {x} {y} {z}" for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+CUBE = "\n".join(
+    [
+        "mtllib cube.mtl",
+        *CORNERS,
+        *("vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"),
+        *("usemtl red", "f 1/1 2/2 4/3 3/4", "f 5/1 7/2 8/3 6/4"),
+        *("usemtl blue", "f 1 5 6 2", "f -6 -5 -1 -2"),
+        *("usemtl squares", "f 1/1 3/2 7/3 5/4", "f 2/1 6/2 8/3 4/4"),
+    ]
+)
+LIBRARY = (
+    "newmtl red\nKa 1 1 1\nKd 0.9 0.1 0.1\nnewmtl blue\n  Kd 0.1 0.1 0.9\n  d 0.5\n"
+    "newmtl squares\nKd 0 0 0\nmap_Kd -s 1 1 1 squares.png\n"
+)
+MESH = '<mesh filename="package://cube.obj"/>'
+TEXTURE = '<material name="t"><texture filename="package://squares.png"/></material>'
+BLACK = '<material name="b"><texture/><color rgba="0 0.0 0 1"/></material>'
+ORANGE = '<material name="o"><color rgba="1 0.5 0 1"/></material>'
+# Of the page: of each mesh its colour, whether it has a texture that was loaded, and its opacity.
+LOOKS = """
+const found = {};
+viewer.scene_tree.find(["meshcat", "robot"]).object.traverse(node => {
+    if (!node.isMesh) return;
+    let part = node, path = [];
+    for (; part.name != "shapes"; part = part.parent) if (part.name && part.name != "<object>") path.unshift(part.name);
+    const m = node.material;
+    found[path.join("/")] = ["#" + m.color.getHexString(), m.map ? m.map.image.width : 0, m.opacity, m.vertexColors];
+});
+return found;"""
+
+
+def visual(shape, material="", where=0):
+    return f'<visual><origin xyz="{where} 0 0"/><geometry>{shape}</geometry>{material}</visual>'
+
+
+@pytest.fixture
+def folder(tmp_path):
+    squares = np.kron(np.indices((4, 4)).sum(axis=0) % 2, np.ones((4, 4)))[..., None] * np.array([0, 200, 0])
+    Image.fromarray(squares.astype(np.uint8)).save(tmp_path / "squares.png")
+    (tmp_path / "cube.obj").write_text(CUBE)
+    (tmp_path / "cube.mtl").write_text(LIBRARY)
+    return tmp_path
+
+
+def robot_with(folder, *visuals):
+    return vp.load_robot(write_urdf(folder, link("l1", extra="".join(visuals)), joint("j1", "base", "l1")))
+
+
+def test_shapes_have_the_colours_of_their_files(show, browser, folder):
+    colored = "\n".join(f"{line} {line[2]} {line[4]} {line[6]}" for line in CORNERS)
+    (folder / "rainbow.obj").write_text(colored + "\nf 1 2 4 3\nf 5 7 8 6\n")
+    robot = robot_with(
+        folder,
+        visual(MESH),
+        visual(MESH, BLACK, 2),
+        visual(MESH, ORANGE, 4),
+        visual(MESH, TEXTURE, 6),
+        visual('<box size="1 1 1"/>', TEXTURE, 8),
+        visual('<mesh filename="package://rainbow.obj"/>', "", 10),
+        visual('<box size="1 1 1"/>', BLACK, 12),
+    )
+    show(robot, np.zeros((1, 1)), dt=1.0)
+    wait_until(lambda: sum(look[1] == 16 for look in browser.execute_script(LOOKS).values()) == 5)
+    found = {name.replace("l1_", ""): look for name, look in browser.execute_script(LOOKS).items()}
+    cube = [["#e61a1a", 0, 1, False], ["#1a1ae6", 0, 0.5, False], ["#ffffff", 16, 1, False]]
+    assert [found[f"0 0/{k}"] for k in range(3)] == cube
+    assert [found[f"1 1/{k}"] for k in range(3)] == cube
+    assert [found[f"2 2/{k}"] for k in range(3)] == [["#ff8000", 0, 1, False]] * 3
+    # Faces without texture coordinates have the colour of the file.
+    assert [found[f"3 3/{k}"][:2] for k in range(3)] == [["#ffffff", 16], ["#1a1ae6", 0], ["#ffffff", 16]]
+    assert found["4 4"][:2] == ["#ffffff", 16]
+    assert found["5 5"] == ["#ffffff", 0, 1, True]
+    assert found["6 6"][0] in ("#e5e5e5", "#e6e6e6")
+
+
+def test_textures_that_are_not_there_are_named(folder, caplog):
+    (folder / "squares.png").unlink()
+    robot = robot_with(folder, visual(MESH), visual('<box size="1 1 1"/>', TEXTURE, 8))
+    with caplog.at_level(logging.WARNING):
+        assert [shape.meshTexturePath for shape in geometry(robot).geometryObjects] == ["", ""]
+        vp.replay(robot, np.zeros((1, 1)), dt=1.0, html=folder / "a.html")
+    assert naming(caplog.messages, "texture", "'package://squares.png'")
+    assert naming(caplog.messages, "texture", "'-s 1 1 1 squares.png'")
+
+
+def test_every_joint_has_a_node_of_its_own(tmp_path):
+    names = ["a/b", "a_b", "shapes", "base", "notes", "a/b 2"]
+    parts = [link(f"l{k}") + joint(name, "base", f"l{k}") for k, name in enumerate(names)]
+    robot = vp.load_robot(write_urdf(tmp_path, *parts))
+    nodes = Picture.of(robot).moving_nodes("robot")
+    assert len(set(nodes)) == len(names)
+    assert not {"robot/shapes/moving", "robot/base/moving", "robot/notes/moving"} & set(nodes)
+    page = vp.replay(robot, np.random.default_rng(0).normal(size=(3, 6)), dt=1.0, html=tmp_path / "a.html")
+    moved = [part["path"] for part in commands(page)[-1]["animations"]]
+    assert len({str(path) for path in moved}) == len(moved) == 6
+    assert labels(["x", "x", "x 2", ""]) == ["x", "x 2", "x 2 2", "_"]
+
+
+# --- films -----------------------------------------------------------------------------------------------------------
+
+
+Q = np.linspace([0.0, 0.0], [1.2, -0.8], 11)
+
+
+@pytest.fixture(scope="module")
+def chain():
+    return vp.planar_chain(2)
+
+
+def frames(path):
+    return np.array(
+        [np.asarray(frame.convert("RGB"), dtype=float) for frame in ImageSequence.Iterator(Image.open(path))]
+    )
+
+
+def test_frames_are_at_exact_times(browser, chain, tmp_path):
+    q = np.repeat([[0.0, 0.0], [1.0, 0.5]], [6, 5], axis=0)  # moves between 0.5 s and 0.6 s alone
+    path = tmp_path / "jump.gif"
+    assert replay(chain, q, dt=0.1, video=path, fps=10.0, size=(320, 240)) == path
+    film = frames(path)
+    assert film.shape == (11, 240, 320, 3)
+    assert Image.open(path).info["duration"] == 100  # [ms]
+    assert (film[:6] == film[0]).all()
+    assert (film[6:] == film[-1]).all()
+    assert (np.abs(film[6] - film[5]).max(axis=-1) > 40.0).mean() > 1e-3
+
+
+def test_an_mp4_and_its_page(browser, chain, tmp_path):
+    path, page = tmp_path / "chain.mp4", tmp_path / "chain.html"
+    assert replay(chain, Q, dt=0.1, html=page, video=path, fps=5.0, size=(320, 240), speed=2.0) == path
+    film = imageio.imread(path, plugin="FFMPEG").astype(float)
+    assert film.shape == (3, 240, 320, 3)
+    assert (np.abs(film[2] - film[0]).max(axis=-1) > 40.0).mean() > 1e-3
+    assert page.stat().st_size > 10_000
+
+
+def test_frame_times():
+    np.testing.assert_allclose(video.frame_times(".mp4", 30.0, 1.0, 99), np.arange(31) / 30.0)
+    np.testing.assert_allclose(video.frame_times(".gif", 30.0, 1.0, 99), 0.03 * np.arange(34))
+    np.testing.assert_allclose(video.frame_times(".gif", 1000.0, 0.1, 99), 0.02 * np.arange(6))
+    assert [len(video.frame_times(kind, 30.0, 100.0, 11)) for kind in video.FORMATS] == [11, 11]
+    np.testing.assert_array_equal(video.frame_times(".gif", 30.0, 0.0, 99), [0.0])
+
+
+def test_says_what_is_missing_and_how_to_get_it(chain, tmp_path, monkeypatch):
+    found, which = importlib.util.find_spec, shutil.which
+
+    def without(*gone):
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in gone else found(name))
+        monkeypatch.setattr(shutil, "which", lambda name: None if name in gone else (which(name) or f"/usr/bin/{name}"))
+        with pytest.raises(vp.MissingDependency) as caught:
+            replay(chain, Q, dt=0.1, video=tmp_path / "chain.gif")
+        return caught.value
+
+    error = without("imageio", "imageio_ffmpeg")
+    assert (error.missing, error.command) == (("imageio", "imageio-ffmpeg"), 'pip install "varpin[video]"')
+    assert isinstance(error, ImportError)
+    assert without("selenium").missing == ("selenium",)
+    nothing = without("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chromedriver")
+    assert nothing.missing == ("chromium", "chromedriver")
+    assert not (tmp_path / "chain.gif").exists()
+
+
+def test_refuses_other_formats_and_sizes(chain, tmp_path):
+    for name, size, facts in [
+        ("chain.avi", (320, 240), ("video", ".gif", ".mp4", "'chain.avi'")),
+        ("chain.mp4", (321, 240), ("size", "even", "321 x 240")),
+        ("chain.mp4", 320, ("size", "width", "height", "320")),
+        ("chain.mp4", (320, 2), ("size", "16", "2")),
+    ]:
+        with refused(vp.InputError, facts):
+            replay(chain, Q, dt=0.1, video=tmp_path / name, size=size)
+
+
+@pytest.mark.slow
+def test_the_command_line_films_with_traces(browser, tmp_path, capsys):
+    path = tmp_path / "finger.gif"
+    start = ["simulate", "finger", "--no-gravity", "--v0", "2", "1", "1", "--dt", "1e-2", "--steps", "10"]
+    assert main([*start, "--video", str(path), "--trace", "tip", "--speed", "0.5", "--quiet"]) == 0
+    assert len(frames(path)) == 7  # 0.2 s of playback, 0.03 s each
+    assert main([*start, "--html", str(tmp_path / "page.html"), "--trace", "nail"]) == 2
+    assert not unnamed(" ".join(capsys.readouterr().err.split()), "--trace", "'finger'", "'nail'")
+    assert main([*start, "--video", str(tmp_path / "finger.avi")]) == 2
+    assert not unnamed(capsys.readouterr().err, "video", ".gif", ".mp4")
+
+
+# --- motions and plans while they are computed -----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return vp.Scene(vp.planar_chain(2))
+
+
+@pytest.fixture
+def opened():
+    with contextlib.ExitStack() as stack:
+        yield lambda *given, **options: stack.enter_context(vp.LiveView(*given, open=False, **options))
+
+
+@pytest.fixture
+def seen(opened, browser):
+    def make(*given, **options):
+        view = opened(*given, **options)
+        connect(browser, online=True)
+        browser.get(view.url)
+        assert view.wait(60.0)
+        return view
+
+    return make
+
+
+def test_the_robot_is_where_the_motion_is_while_it_is_computed(seen, browser):
+    finger = vp.load_robot("finger")
+    scene = vp.Scene(finger, gravity=False, damping=1e-3)
+    view = seen(scene, marks=vp.Marks(trace=True), speed=None, fps=1e6)
+    looks = []
+
+    def progress(done, steps, nodes):
+        view.progress(done, steps, nodes)
+        if len(looks) < 4 or done == steps:
+            wait_until(lambda: shapes_stand(browser, finger, nodes.q[-1]))
+            looks.append(done)
+
+    vp.simulate(scene, [0.1, 0.2, 0.3], [2.0, 1.0, 1.0], dt=1e-5, steps=60_000, progress=progress)
+    assert looks[0] == 0
+    assert looks[-1] == 60_000
+    assert 0 < looks[1] < looks[2] < looks[3] < 60_000
+    assert any("tip" in name or finger.end_effector in name for name in names(browser, ["notes", "live"]))
+    assert "words" in names(browser, ["notes"])
+    assert severe(browser) == []
+
+
+def test_a_motion_takes_the_time_that_it_would_take(opened, scene, monkeypatch):
+    view = opened(scene, speed=2.0, fps=20.0)
+    motion = {"dt": 1e-3, "steps": 1000, "progress": view.progress, "check": False}
+    begin = time.monotonic()
+    vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], **motion)
+    # Nobody looks, so nobody waits.
+    assert time.monotonic() - begin < 0.45
+    monkeypatch.setattr(live._Window, "watched", property(lambda window: True))
+    shown, move = [], view._move
+    monkeypatch.setattr(view, "_move", lambda t, q, now, *rest, **last: shown.append(now) or move(t, q, now, *rest))
+    begin = time.monotonic()
+    end = vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], **motion).t[-1]
+    assert time.monotonic() - begin > 0.45
+    assert shown == sorted(shown)
+    assert len(shown) <= 13
+    assert shown[-1] == end
+
+
+def test_a_controllers_run_is_shown(opened, scene):
+    cost = vp.TrackingCost([0.5, -1.0], 10.0) + vp.VelocityCost(0.1) + vp.ControlCost(1e-4)
+    problem = vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], dt=2e-2, steps=20)
+    view = opened(problem, speed=None)
+    parts = []
+
+    def progress(done, ticks, nodes):
+        view.progress(done, ticks, nodes)
+        parts.append(nodes)
+
+    run = vp.Mpc(problem).run(duration=0.2, progress=progress)
+    np.testing.assert_array_equal(np.concatenate([part.q[1:] for part in parts]), run.motion.q[1:])
+    np.testing.assert_allclose(np.concatenate([part.t[1:] for part in parts]), run.motion.t[1:], rtol=1e-12)
+    np.testing.assert_array_equal(view._q, run.motion.q[-1])
+
+
+def test_the_camera_moves_back_from_what_leaves_the_view(opened, scene):
+    view = opened(scene.robot)
+    before = view._in_view
+    view._keep_in_view(np.array([[9.0, 0.0, 0.0]]))
+    assert view._in_view.max() > 10.0
+    after = view._in_view
+    view._keep_in_view(np.array([[9.5, 0.0, 0.0]]))
+    assert view._in_view is after is not before
+
+
+def test_ctrl_c_ends_the_motion_and_not_the_view(opened, scene):
+    view = opened(scene, speed=None)
+
+    def progress(done, steps, nodes):
+        view.progress(done, steps, nodes)
+        if done:
+            # As if it came between a command and its answer.
+            view._window.zmq_socket.send_multipart([b"url"])
+            raise KeyboardInterrupt
+
+    with pytest.raises(vp.Interrupted) as caught:
+        vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-4, steps=100_000, progress=progress)
+    assert 0 < caught.value.trajectory.steps < 100_000
+    motion = vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=10, progress=view.progress)
+    np.testing.assert_array_equal(view._q, motion.q[-1])
+
+
+def test_a_server_that_dies_costs_the_picture_alone(opened, scene, caplog, monkeypatch):
+    monkeypatch.setattr(live, "_ANSWER_LIMIT", 0.2)
+    view = opened(scene, speed=None)
+    view._window.server_proc.kill()
+    with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
+        motion = vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=10, progress=view.progress)
+    assert motion.steps == 10
+    assert caplog.text.count("the computation continues without it") == 1
+
+
+def test_a_browser_is_started_and_waited_for(scene, monkeypatch, caplog, capfd):
+    asked = []
+    monkeypatch.setattr(page.webbrowser, "open", lambda url, new=0: asked.append(url) or True)
+    monkeypatch.setattr(live.LiveView.wait, "__defaults__", (0.1,))
+    with vp.LiveView(scene) as view:
+        assert asked == [view.url]
+        assert f'<iframe src="{view.url}"' in view._repr_html_()
+    assert "no browser shows" in caplog.text
+    assert capfd.readouterr().out == ""
+    assert "closed" in repr(view)
+    # What is told a closed view is lost, and nothing else.
+    vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=10, progress=view.progress)
+
+
+def test_says_what_does_not_fit(opened, scene):
+    problem = vp.OptimalControlProblem(scene, vp.ControlCost(1.0), [0.0, 0.0], [0.0, 0.0], dt=1e-2, steps=5)
+    other, tell = vp.Scene(vp.planar_chain(3)), opened(scene).progress
+    with refused(vp.InputError, "progress"):
+        vp.solve(problem, progress=tell)
+    with refused(vp.InputError, "'chain2'", "2", "3"):
+        vp.simulate(other, np.zeros(3), np.zeros(3), dt=1e-3, steps=10, progress=tell)
+    for given, options, kind, facts in (
+        (scene, {"marks": vp.Marks(ghost=[[0.0, 0.0]])}, vp.InputError, "ghost"),
+        (scene, {"marks": vp.Marks(trace="hand")}, vp.UnknownFrame, ("trace", "'chain2'", "'hand'")),
+        (scene, {"speed": 0.0}, vp.InputError, ("speed", "0.0")),
+        (scene.robot.model, {}, vp.InputError, ("LiveView", "Robot", "Scene", "OptimalControlProblem")),
+    ):
+        with refused(kind, facts):
+            vp.LiveView(given, **options)
+
+
+def law(t, q, v):
+    return np.array([np.sin(t), -q[0]])
+
+
+CONTROLS = [
+    None,
+    law,
+    vp.OpenLoop(lambda t: [np.sin(t), 0.0]),
+    vp.FirstOrderHold(np.linspace(0, 1, 802).reshape(401, 2)),
+]
+
+
+@pytest.mark.parametrize("controls", CONTROLS)
+def test_who_asks_for_nodes_gets_all_of_them_once(scene, controls, monkeypatch):
+    monkeypatch.setattr("varpin.simulation.simulate._CHUNK", 50)
+    parts = []
+
+    def progress(done, steps, nodes):
+        assert steps == 400
+        assert nodes.t[-1] == pytest.approx(done * 1e-3)
+        parts.append(nodes)
+
+    given = {"q0": [0.3, 0.0], "v0": [0.0, 0.0], "dt": 1e-3, "steps": 400, "controls": controls}
+    given |= {"period": 3} if controls is law else {}
+    told, plain = vp.simulate(scene, **given, progress=progress), vp.simulate(scene, **given)
+    assert len(parts) > 10
+    for name in ("t", "q", "v"):
+        rows = np.concatenate([getattr(parts[0], name)[:1], *(getattr(part, name)[1:] for part in parts)])
+        np.testing.assert_array_equal(rows, getattr(told, name))
+        np.testing.assert_array_equal(rows, getattr(plain, name))
+    for before, after in itertools.pairwise(parts):
+        assert before.t[-1] == after.t[0]
+        np.testing.assert_array_equal(before.q[-1], after.q[0])
+
+
+def test_functions_of_two_arguments_are_told_as_before(scene, capsys):
+    start = {"q0": [0.3, 0.0], "v0": [0.0, 0.0], "dt": 1e-3, "steps": 10}
+    told = []
+    vp.simulate(scene, **start, progress=lambda done, steps: told.append((done, steps)))
+    vp.simulate(scene, **start, progress=lambda *given: told.append(given))
+    assert told == [(10, 10), (10, 10)]
+    vp.simulate(scene, **start, progress=print)
+    assert capsys.readouterr().out == "10 10\n"
+    for wrong in (lambda done: None, 3):
+        with refused(vp.InputError, "progress"):
+            vp.simulate(scene, **start, progress=wrong)
+    vp.simulate(scene, **(start | {"steps": 0}), progress=lambda done, steps, nodes: told.append(nodes.q))
+    np.testing.assert_array_equal(told[-1], [[0.3, 0.0]])

@@ -103,22 +103,6 @@ def test_payload_is_what_pinocchio_makes_of_it(load):
     np.testing.assert_allclose(found, expected[:5, :5], rtol=1e-12, atol=1e-13)
 
 
-@pytest.mark.parametrize(
-    ("given", "facts"),
-    [
-        ({"frame": "world"}, ("'ur5'", "'world'")),
-        ({"mass": 0.0}, ("payload mass", "0.0")),
-        ({"center": [0.0, 1.0]}, ("payload center", "(3,)", "(2,)")),
-        ({"inertia": [1.0, 1.0, 3.0]}, ("payload inertia", "1, 1, 3")),
-        ({"inertia": 2.0}, ("payload inertia", "(3, 3)", "2")),
-        ({"inertia": [[1.0, 0.5, 0], [0, 1.0, 0], [0, 0, 1.0]]}, ("payload inertia", "symmetric")),
-    ],
-)
-def test_payload_that_cannot_be(given, facts):
-    with refused(vp.InputError, facts):
-        vp.load_robot("ur5", payload=vp.Payload(**{"frame": "tool0", "mass": 1.0} | given))
-
-
 def every_force(robot):
     """Forces on all joints in every form of their values, and between two fingers."""
     n = robot.dof
@@ -252,27 +236,3 @@ def test_nothing_is_left_out_of_scenes_with_constraints_or_functions():
         assert not vp.Scene(robot, gravity=False, **more).required(0.0, {"joint_1.0": 0.1}).idle
     with refused(vp.InputError, ("controls", "(16,)", "(1, 3)")):
         vp.Scene(robot).required(0.0, controls=np.zeros(3))
-
-
-def test_locked_joints_are_no_bodies():
-    """A Panda that moves two joints is a two-body arm, whose inertias add up from the links that are carried."""
-    lock = {f"panda_joint{k}": 0.3 for k in (1, 3, 5, 6, 7)} | {"panda_finger_joint1": 0.02}
-    robot, twin = vp.load_robot("panda", lock=lock), vp.load_robot(two_joint_panda(lock))
-    assert robot.dof == robot.tree.parent.size == 2
-    motions = [vp.simulate(vp.Scene(arm), [0.2, -1.0], [0.5, 0.0], dt=5e-3, steps=100) for arm in (robot, twin)]
-    np.testing.assert_allclose(motions[0].q, motions[1].q, rtol=0, atol=1e-11)
-
-
-def two_joint_panda(lock):
-    model = vp.load_robot("panda").free_model
-    data, q = model.createData(), pin.neutral(model)
-    for name, value in (lock | {"panda_finger_joint2": 0.02}).items():
-        q[model.joints[model.getJointId(name)].idx_q] = value
-    pin.forwardKinematics(model, data, q)
-    arm, shoulder, elbow = pin.Model(), model.getJointId("panda_joint2"), model.getJointId("panda_joint4")
-    own = {shoulder: arm.addJoint(0, pin.JointModelRZ(), data.oMi[shoulder], "shoulder")}
-    own[elbow] = arm.addJoint(own[shoulder], pin.JointModelRZ(), data.oMi[shoulder].actInv(data.oMi[elbow]), "elbow")
-    for joint in range(shoulder, model.njoints):
-        carrier = elbow if joint >= elbow else shoulder
-        arm.appendBodyToJoint(own[carrier], model.inertias[joint], data.oMi[carrier].actInv(data.oMi[joint]))
-    return arm

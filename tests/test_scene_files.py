@@ -134,47 +134,38 @@ def table(head, **keys):
     return f"{head}\n" + "".join(f"{key} = {toml(value)}\n" for key, value in keys.items())
 
 
+def of(kind, make, **given):
+    return kind, make, given
+
+
+ELBOW = {"elbow_joint": 0.1}
+APART = {"stiffness": 5.0, "rest": [0.0, 0.01, 0.0], "rotational_stiffness": 0.02}
+APART["rest_rotation"] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
 # Of scenes the robot, forces and noises by kind and arguments, what else there is, and the springs.
 WRITTEN = {
     "joints": (
         "ur5",
         [
-            ("friction", vp.CoulombFriction, {"level": {"elbow_joint": 1e-4}, "width": 0.05}),
-            ("stop", vp.JointStop, {"stiffness": 0.1, "damping": [1e-4, 0, 0, 0, 0, 0], "upper": {"elbow_joint": 1.0}}),
-            ("armature", vp.Armature, {"inertia": 1e-6}),
+            of("friction", vp.CoulombFriction, level={"elbow_joint": 1e-4}, width=0.05),
+            of("stop", vp.JointStop, stiffness=0.1, damping=[1e-4, 0, 0, 0, 0, 0], upper={"elbow_joint": 1.0}),
+            of("armature", vp.Armature, inertia=1e-6),
         ],
         [
-            ("additive", vp.AdditiveNoise, {"intensity": {"elbow_joint": 0.1}}),
-            ("control", vp.ControlNoise, {"intensity": 0.2}),
-            ("state", vp.StateNoise, {"intensity": 0.3, "center": 0.4}),
+            of("additive", vp.AdditiveNoise, intensity=ELBOW),
+            of("control", vp.ControlNoise, intensity=0.2),
+            of("state", vp.StateNoise, intensity=0.3, center=0.4),
         ],
-        {"damping": {"elbow_joint": 0.1}, "friction": 0.2},
+        {"damping": ELBOW, "friction": 0.2},
         {"stiffness": 2.0, "rest": {"elbow_joint": 0.3}},
     ),
     "frames": (
         "allegro_right_hand",
         [
-            (
-                "frame_spring",
-                vp.FrameSpring,
-                {
-                    "a": "link_3.0",
-                    "b": ("link_7.0", [0.0, 0.0, 0.01]),
-                    "stiffness": 5.0,
-                    "rest": [0.0, 0.01, 0.0],
-                    "rotational_stiffness": 0.02,
-                    "rest_rotation": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
-                },
-            ),
-            (
-                "frame_damper",
-                vp.FrameDamper,
-                {"a": "link_3.0", "b": [0, 0.1, 0.1], "damping": [0.1, 0.2, 0.3], "rotational_damping": 0.01},
-            ),
-            (
-                "frame_wrench",
-                vp.FrameWrench,
-                {"frame": "link_7.0", "wrench": [0.01, 0.0, 0.02, 0.0, 1e-3, 0.0], "axes": "frame"},
+            of("frame_spring", vp.FrameSpring, a="link_3.0", b=("link_7.0", [0.0, 0.0, 0.01]), **APART),
+            of("frame_damper", vp.FrameDamper, a="link_3.0", b=[0, 0.1, 0.1], damping=[0.1, 0.2, 0.3]),
+            of("frame_damper", vp.FrameDamper, a="link_7.0", b="link_3.0", damping=0.0, rotational_damping=0.01),
+            of(
+                "frame_wrench", vp.FrameWrench, frame="link_7.0", wrench=[0.01, 0.0, 0.02, 0.0, 1e-3, 0.0], axes="frame"
             ),
         ],
         [],

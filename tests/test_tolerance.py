@@ -225,9 +225,6 @@ def test_command(tmp_path, capsys):
     assert off(scene, motion) <= 1e-7
     assert main([*words, "--tolerance", "1e-4", "--integrator", "Midpoint", "--quiet", "--save", str(path)]) == 0
     assert vp.Trajectory.load(path).integrator == "Midpoint(alpha=0.5)"
-    for option in ("--dt", "--steps"):
-        assert main(["simulate", "finger", option, "1", "--tolerance", "1e-7"]) == 2
-        assert not unnamed(capsys.readouterr().err, option.strip("-"), "tolerance")
 
 
 def test_a_force_that_is_met_within_a_step_is_in_the_motion():

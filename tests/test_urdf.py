@@ -1,13 +1,15 @@
-"""Robots as Pinocchio reads them from any URDF; what is left out is told, and those that cannot be are refused."""
+"""Robots as Pinocchio reads them from any URDF or xacro file; what is left out is told, what cannot be is refused."""
 
 from __future__ import annotations
 
 import os
+import pickle
 import re
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -322,13 +324,6 @@ def test_axes_of_fixed_joints_are_not_read(tmp_path, axis):
     assert [inertial.link for inertial in robot.inertials] == ["l1", "tool"]
 
 
-def test_three_hundred_joints_load_and_step():
-    robot = vp.planar_chain(300, length=1.0 / 300, mass=1.0 / 300)
-    motion = vp.simulate(vp.Scene(robot), np.zeros(300), np.zeros(300), dt=1e-5, steps=1)
-    assert np.isfinite(motion.q).all()
-    assert abs(motion.energy[-1] - motion.energy[0]) < 1e-9
-
-
 def test_threads_that_load_at_once_keep_stderr(tmp_path, capfd):
     path = arm(tmp_path)
     with ThreadPoolExecutor(4) as pool:
@@ -543,3 +538,295 @@ def test_another_package_of_pinocchio_s_name(tmp_path, content):
     found = subprocess.run(run, env={"PYTHONPATH": paths}, capture_output=True, text=True, check=False)
     assert found.returncode == 1
     assert "pip uninstall -y pinocchio" in found.stderr.splitlines()[-1]
+
+
+# --- xacro files and robot_descriptions load as the URDF that they stand for -----------------------------------------
+
+
+HEAD = '<?xml version="1.0"?>\n<robot name="made_up" xmlns:xacro="http://www.ros.org/wiki/xacro">\n'
+PART = '<visual><geometry><mesh filename="package://parts/ball.obj"/></geometry></visual>'
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+
+# A macro in a package beside it, one found by a relative path, an argument, a property and a condition.
+ARM = f"""{HEAD}<xacro:arg name="prefix" default=""/>
+<xacro:arg name="tool" default="false"/>
+<xacro:property name="mass" value="${{0.65 * 2}}"/>
+<xacro:include filename="$(find parts)/macros.xacro"/>
+<xacro:include filename="base.xacro"/>
+<xacro:segment name="$(arg prefix)1" parent="base" mass="${{mass}}"/>
+<xacro:if value="$(arg tool)"><xacro:segment name="$(arg prefix)2" parent="l$(arg prefix)1" mass="0.5"/></xacro:if>
+</robot>
+"""
+SEGMENT = link("l${name}", INERTIAL.replace('"1.3"', '"${mass}"'), PART) + joint("j${name}", "${parent}", "l${name}")
+MACROS = f'{HEAD}<xacro:macro name="segment" params="name parent mass">{SEGMENT}</xacro:macro></robot>'
+
+
+@pytest.fixture
+def workspace(tmp_path):
+    """A folder of two ROS packages; returns the file of the robot."""
+    pytest.importorskip("xacro")
+    for name in ("my_arm", "parts"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "package.xml").write_text(f"<package><name>{name}</name></package>")
+    (tmp_path / "parts" / "macros.xacro").write_text(MACROS)
+    (tmp_path / "parts" / "ball.obj").write_text(TRIANGLE)
+    (tmp_path / "my_arm" / "base.xacro").write_text(HEAD + '<link name="base"/></robot>')
+    path = tmp_path / "my_arm" / "arm.urdf.xacro"
+    path.write_text(ARM)
+    return path
+
+
+@pytest.fixture
+def described(monkeypatch, tmp_path):
+    """Makes a stand-in for robot_descriptions, which clones git repositories on import, with one robot cloned."""
+
+    def make(kind="arm", **files):
+        robots = {name: SimpleNamespace(tags={kind}) for name in ("one_description", "lost_description")}
+        package = SimpleNamespace(DESCRIPTIONS=robots, __path__=[str(tmp_path)], __spec__=None)
+        paths = {name: str(path) if name.endswith("PATH") else path for name, path in files.items()}
+        monkeypatch.setitem(sys.modules, "robot_descriptions", package)
+        monkeypatch.setitem(sys.modules, "robot_descriptions.one_description", SimpleNamespace(**paths))
+
+    return make
+
+
+def assert_is(robot, urdf):
+    """Gravity's torque and the inertia of the robot's one joint are those of a URDF."""
+    expected, q = pin.buildModelFromUrdf(str(urdf)), np.array([0.7])
+    jet = vp.lagrangian_jet(vp.Scene(robot), q, q)
+    gravity = pin.computeGeneralizedGravity(expected, expected.createData(), q)
+    np.testing.assert_allclose(-jet.Lq, gravity, rtol=1e-12)
+    np.testing.assert_allclose(jet.Lvv, pin.crba(expected, expected.createData(), q), rtol=1e-12)
+    # Its mesh is in a package.
+    assert geometry(robot).ngeoms == 1
+
+
+def test_robot_is_that_of_the_urdf_written_by_hand(workspace, tmp_path, monkeypatch):
+    monkeypatch.chdir("/")
+    robot = vp.load_robot(workspace)
+    assert (robot.name, robot.urdf, robot.joint_names) == ("arm", workspace, ("j1",))
+    assert_is(robot, arm(tmp_path))
+
+
+def test_arguments(workspace):
+    robot = vp.load_robot(workspace, xacro_args={"prefix": "left_", "tool": True})
+    assert robot.joint_names == ("jleft_1", "jleft_2")
+    assert robot.model.inertias[2].mass == 0.5
+    with refused(vp.InputError, "arm.urdf.xacro", "'prefx'", "prefix, tool"):
+        vp.load_robot(workspace, xacro_args={"prefx": "left_"})
+
+
+def test_packages_elsewhere(workspace, tmp_path, described):
+    elsewhere = tmp_path / "not" / "near" / "it"
+    elsewhere.mkdir(parents=True)
+    (tmp_path / "parts").rename(elsewhere / "parts")
+    with refused(vp.RobotError, "'parts'") as caught:
+        vp.load_robot(workspace)
+    assert str(caught.value).count("no package") == 1
+    assert vp.load_robot(workspace, package_dirs=[elsewhere]).dof == 1
+    packages = {"parts": str(elsewhere / "parts")}
+    described(XACRO_PATH=workspace, XACRO_ARGS={"prefix": "a_", "tool": "true"}, XACRO_PACKAGE_PATHS=packages)
+    assert vp.load_robot("one_description").joint_names == ("ja_1", "ja_2")
+    assert vp.load_robot("one_description", xacro_args={"prefix": "b_"}).joint_names == ("jb_1", "jb_2")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "facts"),
+    [
+        ("${0.65 * 2}", "${lost * 2}", ("arm.urdf.xacro", "'lost'", "'lost * 2'")),
+        ("</robot>", "", "XML"),
+        ('parent="base"', 'perent="base"', "perent"),
+        ('name="made_up"', 'name="$(arg tooth)"', ("arm.urdf.xacro", "'tooth'", "xacro_args={'tooth'")),
+        ('name="made_up"', "name=\"${xacro.arg('tooth')}\"", ("arm.urdf.xacro", "'tooth'", "xacro_args={'tooth'")),
+    ],
+)
+def test_bad_files_give_one_error(workspace, old, new, facts):
+    workspace.write_text(workspace.read_text().replace(old, new))
+    with refused(vp.RobotError, facts) as caught:
+        vp.load_robot(workspace)
+    # Each thing is said once, and none in the names of Python's classes.
+    assert not re.search(r"<class|Error:|Exception", str(caught.value))
+    assert str(caught.value).count("No such file") <= 1
+
+
+def test_arguments_of_what_is_no_xacro_file(tmp_path):
+    for source in (arm(tmp_path), "ur5"):
+        with refused(vp.InputError, "xacro"):
+            vp.load_robot(source, xacro_args={"prefix": "left_"})
+    with refused(vp.InputError, "xacro_args"):
+        vp.load_robot("ur5", xacro_args=["prefix"])
+
+
+def test_a_robot_of_robot_descriptions(tmp_path, described):
+    """With the posture of its SRDF, and a mesh in a package of its repository."""
+    pytest.importorskip("xacro")
+    folder = tmp_path / "cache" / "repository" / "parts"
+    folder.mkdir(parents=True)
+    (folder / "ball.obj").write_text(TRIANGLE)
+    urdf, srdf = arm(tmp_path), tmp_path / "any.srdf.xacro"
+    urdf.write_text(urdf.read_text().replace("</link>", f"{PART}</link>"))
+    srdf.write_text(f'{HEAD}<group_state name="home"><joint name="j1" value="${{0.25 * 2}}"/></group_state></robot>')
+    described(URDF_PATH=urdf, SRDF_PATH=srdf, REPOSITORY_PATH=folder.parent)
+    robot = vp.load_robot("one_description")
+    assert (robot.name, robot.urdf, robot.posture("home")) == ("one_description", urdf, [0.5])
+    assert_is(robot, urdf)
+    described("biped", URDF_PATH=urdf)
+    with refused(vp.RobotError, "'one_description'", "made_up.urdf"):
+        vp.load_robot("one_description")
+
+
+def test_a_download_that_fails(tmp_path, described):
+    (tmp_path / "lost_description.py").write_text("raise RuntimeError('Could not\\n resolve host: github.com')\n")
+    described()
+    for _ in range(2):
+        with refused(vp.RobotError, "'lost_description'", "Could not resolve host: github.com"):
+            vp.load_robot("lost_description")
+
+
+def test_without_the_packages(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "xacro", None)
+    (tmp_path / "arm.urdf.xacro").write_text(ARM)
+    with refused(vp.MissingDependency, "arm.urdf.xacro", "xacro", "varpin[xacro]"):
+        vp.load_robot(tmp_path / "arm.urdf.xacro")
+    monkeypatch.setitem(sys.modules, "robot_descriptions", None)
+    with refused(vp.MissingDependency, "'iiwa14_description'", "robot_descriptions", "varpin[descriptions]"):
+        vp.load_robot("iiwa14_description")
+    with refused(vp.RobotNotFound, "ur5"):
+        vp.load_robot("ur55")
+    # Names of the package without their ending are unknown, and the message has the pip command.
+    with refused(vp.RobotNotFound, "'iiwa14'", "iiwa14_description", "varpin[descriptions]"):
+        vp.load_robot("iiwa14")
+    with refused(vp.RobotNotFound, "arm.urdf") as info:
+        vp.load_robot("arm.urdf")
+    assert "descriptions" not in str(info.value)
+
+
+# --- postures of SRDF files are the configurations that Pinocchio reads from them ------------------------------------
+
+
+# Robots of example-robot-data and the postures in their SRDF files, under srdf/ of each.
+POSTURES = {name: (name, ("default",)) for name in ("alex_nub_hands", "alex_psyonic_hands", "alex_sake_hands")}
+POSTURES |= {"panda": ("panda", ("default",)), "panda_collision": ("panda", ("default",))}
+POSTURES |= {"finger_edu": ("finger_edu", ("hanging",)), "kinova": ("kinova", ("arm_up",))}
+POSTURES |= {"talos_arm": ("talos", ("half_sitting",)), "xarm7": ("xarm7", ("home", "hold-up"))}
+POSTURES |= {"z1": ("z1", ("home", "arm_up"))}
+
+
+def of_joint(model, q, name):
+    own = model.joints[model.getJointId(name)]
+    return q[own.idx_q : own.idx_q + own.nq]
+
+
+@pytest.mark.parametrize("name", POSTURES)
+def test_published_postures_are_pinocchio_s(load, name):
+    robot, (file, names) = load(name), POSTURES[name]
+    assert robot.postures == names
+    model = pin.buildModelFromUrdf(str(robot.urdf))
+    pin.loadReferenceConfigurations(model, str(robot.urdf.parent.parent / "srdf" / f"{file}.srdf"))
+    for posture in names:
+        q, expected = robot.configuration(robot.posture(posture)), model.referenceConfigurations[posture]
+        for each in robot.joint_names:
+            np.testing.assert_allclose(of_joint(robot.model, q, each), of_joint(model, expected, each), atol=1e-12)
+
+
+SRDF = """<robot name="made_up">
+<group_state name="home" group="arm"><joint name="j1" value="0.5"/><joint name="j2" value="9"/></group_state>
+<group_state name="home" group="hand"><joint name="j3" value="-0.25"/>
+<joint name="root" value="0 0 0 0 0 0 1"/></group_state>
+<group_state name="there" group="arm"><joint name="j3" value="0.6 0.8"/></group_state>
+<group_state name="there" group="hand"><joint name="j3" value="0.1"/></group_state>
+<group_state name="none" group="other"><joint name="k1" value="1"/></group_state></robot>"""
+
+
+@pytest.fixture
+def urdf(tmp_path):
+    parts = [link(f"l{k}") for k in (1, 2, 3, 4)]
+    joints = [joint("j1", "base", "l1"), joint("j2", "l1", "l2", inside=mimic("j1", 2, 0.1))]
+    joints += [joint("j3", "l2", "l3", "continuous"), joint("j4", "l3", "l4", "prismatic")]
+    return write_urdf(tmp_path, *parts, *joints)
+
+
+def test_coordinates_of_a_posture(urdf):
+    (urdf.parent / "made_up.srdf").write_text(SRDF)
+    robot = vp.load_robot(urdf)
+    assert robot.joint_names == ("j1", "j3", "j4")
+    assert robot.postures == ("home", "there")
+    np.testing.assert_array_equal(robot.posture("home"), [0.5, -0.25, 0.0])
+    np.testing.assert_array_equal(robot.posture("home", others={"j4": 0.3, "j1": 7.0}), [0.5, -0.25, 0.3])
+    np.testing.assert_array_equal(robot.posture("hand/home", others=[1.0, 2.0, 3.0]), [1.0, -0.25, 3.0])
+    assert robot.posture("arm/there")[1] == pytest.approx(np.arctan2(0.8, 0.6))
+    assert vp.load_robot(urdf, lock={"j3": 1.0}).posture("home").tolist() == [0.5, 0.0]
+    assert pickle.loads(pickle.dumps(robot)).posture("home").tolist() == [0.5, -0.25, 0.0]
+
+
+def test_names_and_files_that_are_not_there(urdf):
+    (urdf.parent / "made_up.srdf").write_text(SRDF)
+    robot = vp.load_robot(urdf)
+    with refused(vp.UnknownPosture, "'hme'", "'home'", "'there'") as caught:
+        robot.posture("hme")
+    assert caught.value.known == ("home", "there")
+    with refused(vp.InputError, "'j3'", "'arm/there'", "'hand/there'"):
+        robot.posture("there")
+    with refused(vp.UnknownPosture, "'leg/home'"):
+        robot.posture("leg/home")
+    with refused(vp.UnknownJoint, "'j9'"):
+        robot.posture("home", others={"j9": 1.0})
+    with refused(vp.UnknownPosture, "srdf=path"):
+        vp.load_robot("ur5").posture("home")
+    with refused(vp.FileError, "lost.srdf"):
+        vp.load_robot(urdf, srdf="lost.srdf")
+    with refused(vp.InputError, "srdf", "3"):
+        vp.load_robot(urdf, srdf=3)
+
+
+@pytest.mark.parametrize(
+    ("place", "name", "found"),
+    [
+        ("{}/made_up.srdf", "another", True),
+        ("srdf/made_up.srdf", "another", True),
+        ("srdf/any.srdf", "made_up", True),
+        ("srdf/any.srdf", "another", False),
+        ("srdf/one.srdf srdf/two.srdf", "made_up", False),
+        ("deep/srdf/made_up.srdf", "made_up", False),
+    ],
+)
+def test_where_the_file_is_looked_for(urdf, tmp_path, place, name, found):
+    folder = tmp_path / "urdf"
+    folder.mkdir()
+    urdf = urdf.rename(folder / urdf.name)
+    for each in place.format("urdf").split():
+        file = tmp_path / each
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(SRDF.replace("made_up", name))
+    assert bool(vp.load_robot(urdf).postures) == found
+    assert vp.load_robot(urdf, srdf=str(file)).postures == ("home", "there")
+
+
+BAD = {
+    "no number": (SRDF.replace('"0.5"', '"half"'), ("'home'", "'j1'", "'half'")),
+    "no value": (SRDF.replace('value="0.5"', ""), ("'j1'", "''")),
+    "infinite": (SRDF.replace('"0.5"', '"inf"'), ("'j1'", "'inf'")),
+    "broken": (SRDF[:-5], ("made_up.srdf", "XML")),
+    "empty": ("", ("made_up.srdf", "empty")),
+    "another format": (SRDF.replace("robot", "sdf"), ("made_up.srdf", "<sdf>")),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_files(urdf, caplog, kind):
+    text, facts = BAD[kind]
+    path = urdf.parent / "made_up.srdf"
+    path.write_text(text)
+    with refused(vp.RobotError, facts):
+        vp.load_robot(urdf, srdf=path)
+    # One that nobody asks for is told of.
+    assert vp.load_robot(urdf).postures == ()
+    assert not unnamed(caplog.text, facts)
+
+
+def test_reference_configurations_of_a_model(urdf):
+    model = pin.buildModelFromUrdf(str(urdf))
+    q = pin.randomConfiguration(model, -np.ones(model.nq), np.ones(model.nq))
+    model.referenceConfigurations["here"] = q
+    robot = vp.load_robot(model)
+    np.testing.assert_allclose(robot.configuration(robot.posture("here")), q, atol=1e-15)

@@ -27,7 +27,7 @@ from varpin.signals.controls import commands_of
 from varpin.signals.policy import LinearPolicy
 from varpin.simulation.check import check
 from varpin.simulation.failures import NoiseError, StepFailure
-from varpin.simulation.loop import unstable_loop
+from varpin.simulation.loop import Gains, unstable_loop
 from varpin.support.checks import count, told_motion
 from varpin.support.executors import executing, in_order, take_all
 from varpin.support.frozen import Frozen
@@ -294,10 +294,11 @@ def _with_findings(result: MonteCarlo, every: Paths, parts: Sequence[Found], poo
         found = findings_of_paths(every.shared, q0, v0, joined(parts, 0).extremes, pool)
     elif np.isfinite(parts[0].costs).all():
         # The first path, whose noise Python evaluates.
-        motion, scene, policy = path_of(every), every.problem.scene, every.policy
+        motion, scene, policy, integrator = path_of(every), every.problem.scene, every.policy, every.problem.integrator
         # The loop's check is for held controls.
-        loop = () if every.problem.linear else unstable_loop(scene, motion, policy.hold_at(every.problem.dt))
-        own = (*loop, *check(scene, every.problem.integrator, motion, policy).warnings)
+        gains = Gains(policy.feedback, integrator.variational)
+        loop = () if every.problem.linear else unstable_loop(scene, motion, policy.hold_at(every.problem.dt), gains)
+        own = (*loop, *check(scene, integrator, motion, policy).warnings)
         found = tuple(finding.about("path 0: ") for finding in own)
     return replace(result, warnings=(*_lost(result), *found))
 

@@ -33,7 +33,7 @@ from varpin.simulation.check import check
 from varpin.simulation.choice import given_integrator, usual_integrator
 from varpin.simulation.failures import Interrupted, StepFailure
 from varpin.simulation.limits import beyond_limits
-from varpin.simulation.loop import unstable_loop
+from varpin.simulation.loop import Gains, unstable_loop
 from varpin.simulation.record import Progress
 from varpin.simulation.simulate import noise_forgotten, simulate
 from varpin.support.checks import JointValues, control_values, count, positive, real, told_motion
@@ -319,7 +319,7 @@ class Mpc:
         constraints, violated = loop.constraints(motion)
         found = (
             *noise_forgotten(scene, rng),
-            *unstable_loop(scene, motion, plant.substeps),
+            *unstable_loop(scene, motion, plant.substeps, loop.gains()),
             *motion.warnings,
             *loop.without_plans(),
             *violated,
@@ -419,6 +419,13 @@ class _Loop:
     def told(self, motion: Trajectory) -> Trajectory:
         """The plant's motion up to where it ended early, with its warnings and those of ticks without a plan."""
         return motion.changed(warnings=(*beyond_limits(self.plant.scene, motion), *self.without_plans()))
+
+    def gains(self) -> Gains | None:
+        """The feedback of each tick; None for controls that are linear between nodes."""
+        if self.problem.linear:
+            return None
+        rows = (tick.plan.policy.feedback[min(tick.age, _lines(tick.plan) - 1)] for tick in self.ticks)
+        return Gains(np.array(list(rows)), self.problem.integrator.variational)
 
     def without_plans(self) -> list[Finding]:
         """Warnings if more than a few plans took longer than the budget or the period, or searches found no plan."""

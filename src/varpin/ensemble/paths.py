@@ -21,7 +21,7 @@ from varpin.mechanics.scene import Scene
 from varpin.mechanics.wiener import Children
 from varpin.signals.commands import as_moved, lines, rows, with_ends
 from varpin.simulation.check import check
-from varpin.simulation.loop import unstable_loop
+from varpin.simulation.loop import Gains, unstable_loop
 from varpin.simulation.record import Motions, located
 from varpin.support.frozen import Frozen
 
@@ -231,5 +231,6 @@ def examine(task: Task) -> tuple[Finding, ...]:
     motion, _ = motions.under(shared.commands, increments=drawn)
     # The loop's check is for held controls.
     held = len(shared.commands.gains) and not shared.linear
-    loop = unstable_loop(shared.scene, motion, shared.commands.hold) if held else ()
+    gains = Gains(shared.commands.gains, shared.integrator.variational)
+    loop = unstable_loop(shared.scene, motion, shared.commands.hold, gains) if held else ()
     return (*loop, *check(shared.scene, shared.integrator, motion, shared.commands if held else None).warnings)

@@ -35,6 +35,7 @@ from varpin.support.frozen import Frozen
 logger = logging.getLogger(__name__)
 
 ControlLaw = Callable[[float, Floats, Floats], JointValues]
+Copies = Callable[[], ControlLaw]
 # Values (K, m) of a function at times (K,) [s] in steps (K,).
 Values = Callable[[Floats, Integers], Floats]
 
@@ -99,20 +100,24 @@ class _Copier(cloudpickle.Pickler):  # type: ignore[misc]
         return make, (*arguments, None, extra), *rest
 
 
-def copied(law: ControlLaw) -> ControlLaw | None:
-    """A copy of a control law with all that it changes when it is called; None if it cannot be copied.
+def copier(law: ControlLaw) -> Copies | None:
+    """What makes copies of a control law as it is now, with all that it changes when it is called; None if it cannot.
 
     Copies are by value, as of functions that are sent to other processes: calls of a copy change nothing of the user's
     but what stands in modules that the law imports. Frozen objects, and those of Pinocchio, are shared.
     """
     file = io.BytesIO()
-    try:
-        writer = _Copier(file, law)
-        writer.dump(law)
-        file.seek(0)
-        reader = pickle.Unpickler(file)
+    writer = _Copier(file, law)
+
+    def copy() -> ControlLaw:
+        reader = pickle.Unpickler(io.BytesIO(file.getvalue()))
         reader.persistent_load = writer.shared.__getitem__  # type: ignore[method-assign]
-        copy: ControlLaw = reader.load()
+        made: ControlLaw = reader.load()
+        return made
+
+    try:
+        writer.dump(law)
+        copy()
     except Exception as error:
         # What a law refers to may be anything: a socket, a running generator.
         logger.debug("a control law cannot be copied: %r", error)

@@ -230,6 +230,11 @@ class LinearPolicy(Frozen):
         line = ", linear between nodes" if self.linear else ""
         return f"LinearPolicy({steps} intervals of {self.hold} steps, {m} controls, {size // 2} joints{on}{line})"
 
+    @property
+    def feedback(self) -> Floats:
+        """Gains on the state and, where they exist, on the previous control: (N, m, 2n) or (N, m, 2n + m)."""
+        return self.gains if self.previous_gains is None else np.concatenate([self.gains, self.previous_gains], axis=2)
+
     def without_feedback(self) -> LinearPolicy:
         """The same feed-forward controls with zero gains."""
         gains = np.zeros_like(self.gains)
@@ -301,10 +306,9 @@ class LinearPolicy(Frozen):
             )
         if self.gains.shape[1:] != (controls, 2 * dof):
             raise InputError(f"the policy's gains must have shape (N, {controls}, {2 * dof}), got {self.gains.shape}")
-        gains, reference = self.gains, self.reference
-        if self.previous_gains is not None and self.previous is not None:
-            gains = np.concatenate([gains, self.previous_gains], axis=2)
+        reference = self.reference
+        if self.previous is not None:
             reference = np.concatenate([reference, self.previous], axis=1)
         before = np.zeros((0, controls)) if self.before is None else self.before[None].copy()
-        found = Commands(self.u, gains, reference, hold, self.limits, before)
+        found = Commands(self.u, self.feedback, reference, hold, self.limits, before)
         return found if not self.linear else found._replace(stage_times=np.array(tuple(stage_times) or (0.5,)))

@@ -1,38 +1,46 @@
-"""The law of a digital control loop and its stability, from a finished motion: the law is not called.
+"""The stability of a digital control loop at its period, from a finished motion and copies of its control law.
 
-By theory, where the record determines the law u = Kq q + Kv v + S L_q(q, 0) + c: the loop is linearized at the
-equilibrium next to the motion, under constraints on the tangent space. With the plant's exact step under a zero-order
-hold, x' = A x + B u, it is unstable if the spectral radius of A + B K exceeds one (Franklin, Powell and Workman 1998,
-section 4.3). Growth that the law would have in continuous time too, as in a falling pendulum, gives no warning.
+At some states of the motion the law is differentiated, :mod:`varpin.signals.responses`. With the plant's exact step
+under a zero-order hold at the law's equilibrium, x' = A x + B u, the loop is unstable if the spectral radius of the
+step of (x_k, x_(k-1), ...) exceeds one (Franklin, Powell and Workman 1998, section 4.3). Growth that the law would have
+in continuous time too, as in a falling pendulum, gives no warning.
 
-By the record, for other laws: a control turns back every few periods, or grows while it does work.
+A law that does not respond to small displacements, as at its limits, shows by turning back every few periods.
 """
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 
 from varpin.arrays import Floats, Integers
-from varpin.errors import AssemblyError, LinearizationError, SingularMassMatrix
+from varpin.errors import AssemblyError, ControlError, LinearizationError, SingularMassMatrix
 from varpin.finding import Finding
 from varpin.integrators.explicit import accelerations
 from varpin.mechanics.assembly import nearest
-from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
+from varpin.signals.functions import Copies
+from varpin.signals.responses import MEMORY, responses
+from varpin.simulation.spectrum import masses
+from varpin.support.one_thread import one_thread
 from varpin.trajectory import Trajectory
 
-# Least nodes of a fit, spread over the motion, but four a joint at least: 30 to 300 give the same.
-_NODES = 100
-# Largest error of a fit by that of squares of the state: short smooth curves fit any function. 1e-9 to 1e-6: the same.
-_TELLING = 1e-6
-# Share of the largest below which a direction of the motion or the force at an equilibrium is zero: 1e-11 to 1e-6.
-NOTHING = 1e-8
+logger = logging.getLogger(__name__)
+
+# Most states of a motion, and most turns, at which the law is differentiated.
+_NODES = 5
+# Iterations of Newton's method, and its last step [rad or m].
+_ITERATIONS, _CONVERGED = 30, 1e-8
+# Stiffness, as a share of the largest, below which a direction is free to stay anywhere.
+_SINGULAR = 1e-6
 # Rank tolerance of the constraints in the metric of the kinetic energy, relative to the largest singular value.
 _RANK = 1e-9
-# Least growth a period: rounding of fitted gains may split double eigenvalues by 3e-6. 0 to 1e-5: the same.
+# Least growth a period: rounding of differences may split double eigenvalues by 3e-6. 0 to 1e-5: the same.
 _GROWTH = 1e-5
 # The period causes growth if its exponent exceeds that in continuous time by this factor: 1.1 to 3 give the same.
 _BY_PERIOD = 1.5
@@ -43,98 +51,13 @@ _SHORTER = 0.9
 _TURNS, _WINDOW, _SWING = 9, 20, 0.1
 # Least share of the turns that a linear function of the state tells for them to be feedback: of sensor noise 0.09.
 _FOLLOWS = 0.15
-# Least growth of controls from the first quarter of a motion to the last: 10 to 100 give the same.
-_GREW = 30.0
 
 
-@dataclass(frozen=True)
-class Law:
-    """A control law from a record: u = K (q, v, L_q(q, 0)) + c, with the forces L_q(q, 0) of gravity and springs.
+class Gains(NamedTuple):
+    """Linear feedback: gains (P, m, 2n) or, with columns for the previous control, (P, m, 2n + m), of each period."""
 
-    Attributes:
-        K: (m, 3n).
-        c: (m,).
-        directions: Of (q, v), in which the motion tells the law (2n, r).
-        near: A configuration of the motion (n,) [rad or m].
-    """
-
-    K: Floats
-    c: Floats
-    directions: Floats
-    near: Floats
-
-
-def law_of(scene: Scene, trajectory: Trajectory, hold: int) -> Law | None:
-    """The law of a motion under feedback every ``hold`` steps, if its record tells it."""
-    at, x, u = decisions(trajectory, hold)
-    # Commands of kinematic inputs are positions.
-    if scene.inputs or len(at) < 3:
-        return None
-    with np.errstate(all="ignore"):
-        try:
-            return _law(scene, x, u)
-        except (np.linalg.LinAlgError, LinearizationError):
-            return None
-
-
-def decisions(trajectory: Trajectory, hold: int) -> tuple[Integers, Floats, Floats]:
-    """The nodes (P,) at which a period begins, the states (q, v) (P, 2n) there, and the controls (P, m)."""
-    at = np.arange(0, trajectory.steps, hold)
-    return at, np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1), trajectory.u[at]
-
-
-def _law(scene: Scene, x: Floats, u: Floats) -> Law | None:
-    """The law from all nodes or, where it clips, of each control from the nodes at which it is inside its limits."""
-    law = fitted_law(scene, x, u)
-    at_end = u == np.array([u.min(axis=0), u.max(axis=0)])[:, None]
-    clipped = (at_end & (at_end.sum(axis=1) > 1)[:, None]).any(axis=0)
-    if law is not None or not clipped.any():
-        return law
-    laws = [fitted_law(scene, x[~rows], u[~rows, k : k + 1]) for k, rows in enumerate(clipped.T)]
-    # Directions that one control does not know cannot be combined with those of another.
-    known = [law for law in laws if law is not None and law.directions.shape[1] >= x.shape[1]]
-    if len(known) < len(laws):
-        return None
-    K, c = np.concatenate([law.K for law in known]), np.concatenate([law.c for law in known])
-    return Law(K, c, known[0].directions, known[0].near)
-
-
-def fitted_law(scene: Scene, x: Floats, u: Floats) -> Law | None:
-    """The law that gives u (P, m) at states (q, v) = x (P, 2n), if there is one that the record tells."""
-    n = x.shape[1] // 2
-    if len(x) < 3:
-        return None
-    # An odd interval: controls may alternate.
-    every = 1 + 2 * (len(x) // max(2 * _NODES, 8 * n))
-    x, u = x[::every], u[::every]
-    pulled = (np.append(state, lagrangian_jet(scene, state[:n], np.zeros(n)).Lq) for state in x)
-    fit = _affine(x, u) or _affine(np.array(list(pulled)), u)
-    if fit is None:
-        return None
-    K, c, directions = fit
-    K = np.pad(K, ((0, 0), (0, 3 * n - K.shape[1])))
-    return Law(K, c, directions[: 2 * n], x[0, :n])
-
-
-def _affine(x: Floats, u: Floats) -> tuple[Floats, Floats, Floats] | None:
-    """K (m, k), c (m,) of u = K x + c, if the record tells that, and directions (k, r) of x; the least of equal K."""
-    mean, mean_u = x.mean(axis=0), u.mean(axis=0)
-    size = np.std(x, axis=0)
-    moving = size > NOTHING * size.max()
-    unit = np.where(moving, size, np.inf)
-    state, target = (x - mean) / unit, u - mean_u
-    left, sizes, right = np.linalg.svd(state, full_matrices=False)
-    known = sizes > NOTHING * sizes[0]
-    if not moving.any() or len(x) < known.sum() + 2:
-        return None
-    left, directions = left[:, known], right[known].T
-    squares = state[:, moving] ** 2 - 1.0
-    missed = np.abs(squares - left @ (left.T @ squares)).max(axis=0) / np.abs(squares).max(axis=0)
-    off = np.abs(target - left @ (left.T @ target)).max()
-    if off > _TELLING * np.median(missed) * np.abs(target).max():
-        return None
-    K = ((directions / sizes[known]) @ (left.T @ target)).T / unit
-    return K, mean_u - K @ mean, directions * np.where(moving, size, 0.0)[:, None]
+    rows: Floats
+    momentum: bool  # on (q, p), else on (q, v)
 
 
 @dataclass(frozen=True)
@@ -144,40 +67,130 @@ class Loop:
     Attributes:
         A: Rate of (y, y') by (y, y') (2f, 2f) [1/s].
         B: By u (2f, m).
-        K: The law (m, 2f).
-        known: Orthonormal directions of (y, y') in which the law is known (2f, r).
+        H: Of u by (y, y') of this period and those before (J, m, 2f).
+        kept: Ratio of the responses that follow the last of H.
     """
 
     A: Floats
     B: Floats
-    K: Floats
-    known: Floats
+    H: Floats
+    kept: float
 
     def mode(self, period: float) -> tuple[float, Floats]:
-        """Spectral radius over a period [s] with zero-order hold, and sizes of the controls in that mode (m,)."""
-        size, m = self.B.shape
+        """Spectral radius over a period [s] with zero-order hold, and sizes of the controls in that mode (m,).
+
+        The radius is NaN where numbers overflow.
+        """
+        (size, m), J = self.B.shape, len(self.H)
         held = scipy.linalg.expm(period * np.block([[self.A, self.B], [np.zeros((m, size + m))]]))
-        step = held[:size, :size] + held[:size, size:] @ self.K
-        factors, modes = np.linalg.eig(self.known.T @ step @ self.known)
+        # The state is (x_k, ..., x_(k-J+1), y_k), with controls y of what was before.
+        control = np.concatenate([*self.H, np.eye(m)], axis=1)
+        step = np.eye(J * size + m, k=-size)
+        step[:size] = held[:size, size:] @ control
+        step[:size, :size] += held[:size, :size]
+        step[J * size :] = 0.0
+        step[J * size :, (J - 1) * size : J * size] = self.kept * self.H[-1]
+        step[J * size :, J * size :] = self.kept * np.eye(m)
+        if not np.isfinite(step).all():
+            return np.nan, np.zeros(m)
+        factors, modes = np.linalg.eig(step)
         largest = int(np.argmax(np.abs(factors)))
-        return float(np.abs(factors[largest])), np.abs(self.K @ self.known @ modes[:, largest])
+        return float(np.abs(factors[largest])), np.abs(control @ modes[:, largest])
+
+    def grows(self, period: float) -> bool:
+        """Whether the loop is unstable because of its period [s]."""
+        radius, _ = self.mode(period)
+        rate = float(np.linalg.eigvals(self.A + self.B @ self.H.sum(axis=0)).real.max())
+        return radius > 1.0 + _GROWTH and bool(np.log(radius) > _BY_PERIOD * max(rate, 0.0) * period)
 
 
-def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[Finding, ...]:
-    """The warning of a loop that is unstable at its period of ``hold`` steps; empty if stable, or nothing is known."""
-    period, (at, x, u) = hold * trajectory.dt, decisions(trajectory, hold)
+def unstable_loop(
+    scene: Scene, trajectory: Trajectory, hold: int = 1, law: Copies | Gains | None = None
+) -> tuple[Finding, ...]:
+    """The warning of a loop that is unstable at its period of ``hold`` steps; empty if stable, or nothing is known.
+
+    ``law`` makes copies of the law as it was before the motion, or has its gains; None if there are neither. It is told
+    of if the loop is unstable at most of some states spread over the motion, or over the turns of a control.
+    """
+    period, at = hold * trajectory.dt, np.arange(0, trajectory.steps, hold)
+    t, u, x = trajectory.t[at], trajectory.u[at], np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1)
     if len(at) < 3 or not np.ptp(u, axis=0).any():
         return ()
-    law = law_of(scene, trajectory, hold)
-    found: tuple[Finding, ...] = ()
-    with np.errstate(all="ignore"):
-        try:
-            found = () if law is None else _by_theory(scene, law, period)
-        except (np.linalg.LinAlgError, LinearizationError):
-            law = None
-        if law is None and not trajectory.dw.any():
-            found = _by_turns(scene, x, u, trajectory.t[at], period)
-        return found or _by_growth(scene, trajectory, u, period)
+    worst, turning = _turning(u)
+    groups = [_spread(nodes) for nodes in (_inside(u), turning)]
+    with np.errstate(all="ignore"), one_thread():
+        loops = _loops(scene, law, t, x, u, sorted(set().union(*groups)))
+        for nodes in groups:
+            found = _by_theory(scene, [loops[k] for k in nodes if k in loops], period)
+            if found:
+                return found
+    if trajectory.dw.any() or any(k in loops and loops[k].H[:, worst].any() for k in groups[-1]):
+        return ()
+    return _by_turns(scene, x, u, t, worst, turning)
+
+
+def _spread(nodes: Integers) -> list[int]:
+    """Some of the nodes, evenly spread."""
+    chosen = np.unique(np.linspace(0, len(nodes) - 1, min(_NODES, len(nodes))).astype(np.int64))
+    return [int(k) for k in nodes[chosen]]
+
+
+def _inside(u: Floats) -> Integers:
+    """The nodes but the first and the last at which the fewest controls of u (P, m) are at an end that they repeat."""
+    at_end = u == np.array([u.min(axis=0), u.max(axis=0)])[:, None]
+    clipped = (at_end & (at_end.sum(axis=1) > 1)[:, None]).any(axis=0).sum(axis=1)[1:-1]
+    return 1 + np.flatnonzero(clipped == clipped.min())
+
+
+def _centres(x: Floats) -> Floats:
+    """Means (P - 2, 2n) of three states of x (P, 2n), where oscillations by which controls alternate are at rest."""
+    means: Floats = 0.25 * (x[:-2] + 2.0 * x[1:-1] + x[2:])
+    return means
+
+
+def _turning(u: Floats) -> tuple[int, Integers]:
+    """The control of u (P, m) that turns back most within a window, and the nodes at which it does, if it is often."""
+    changes = np.diff(u, axis=0)
+    far = np.abs(changes) >= _SWING * np.ptp(u, axis=0)
+    turns = (changes[1:] * changes[:-1] < 0.0) & far[1:] & far[:-1]
+    most = [np.convolve(each, np.ones(_WINDOW)).max() for each in turns.T]
+    worst = int(np.argmax(most))
+    return worst, 1 + np.flatnonzero(turns[:, worst] & (most[worst] >= _TURNS))
+
+
+def _loops(
+    scene: Scene, law: Copies | Gains | None, t: Floats, x: Floats, u: Floats, nodes: Sequence[int]
+) -> dict[int, Loop]:
+    """The loops with a law at some nodes of times t (P,), states x (P, 2n) and controls u (P, m), where it responds."""
+    # Commands of kinematic inputs are positions.
+    if law is None or scene.inputs:
+        return {}
+    middle, n = _centres(x), x.shape[1] // 2
+    centres = {k: middle[k - 1] for k in nodes}
+    given: Iterable[tuple[int, Floats, Floats]]
+    if isinstance(law, Gains):
+        given = ((k, u[k], _of_gains(scene, law, k, centres[k])) for k in nodes)
+    else:
+        given = responses(scene, law, t, x, u, centres)
+    found = {}
+    try:
+        for k, control, H in given:
+            known = H.any() and np.isfinite(H).all()
+            loop = _at_equilibrium(scene, x[0, :n], centres[k], control, H) if known else None
+            if loop is not None:
+                found[k] = loop
+    except (AssemblyError, SingularMassMatrix, ControlError, LinearizationError, np.linalg.LinAlgError) as error:
+        logger.debug("a control law is differentiated at %d of %d states: %r", len(found), len(nodes), error)
+    return found
+
+
+def _of_gains(scene: Scene, gains: Gains, k: int, state: Floats) -> Floats:
+    """The responses (J, m, 2n) of linear feedback at node k."""
+    n = len(state) // 2
+    K, G = np.split(gains.rows[k], [2 * n], axis=1)
+    if gains.momentum:
+        K = np.concatenate([K[:, :n], K[:, n:] @ masses(scene, state[None, :n])[0]], axis=1)
+    return np.array([np.linalg.matrix_power(G, i) @ K for i in range(MEMORY)]) if G.size else K[None]
 
 
 def _finding(scene: Scene, control: int, text: str, value: float, time: float | None = None) -> tuple[Finding, ...]:
@@ -187,16 +200,14 @@ def _finding(scene: Scene, control: int, text: str, value: float, time: float | 
     return (Finding("unstable loop", text.format(name), joint=joint, time=time, value=value),)
 
 
-def _by_theory(scene: Scene, law: Law, period: float) -> tuple[Finding, ...]:
-    """The warning if the spectral radius of the loop exceeds one because of the period [s]."""
-    loop = loop_at_rest(scene, law)
-    if not loop.known.size:
+def _by_theory(scene: Scene, loops: Sequence[Loop], period: float) -> tuple[Finding, ...]:
+    """The warning if most loops are unstable because of the period [s], about the one in the middle."""
+    unstable = sorted((loop for loop in loops if loop.grows(period)), key=lambda loop: loop.mode(period)[0])
+    if 2 * len(unstable) <= len(loops):
         return ()
+    loop = unstable[len(unstable) // 2]
     radius, sizes = loop.mode(period)
-    rate = float(np.linalg.eigvals(loop.known.T @ (loop.A + loop.B @ loop.K) @ loop.known).real.max())
-    if not radius > 1.0 + _GROWTH or np.log(radius) <= _BY_PERIOD * max(rate, 0.0) * period:
-        return ()
-    stable = next((float(T) for T in period * _SHORTER ** np.arange(1, 60) if loop.mode(T)[0] < 1.0), None)
+    stable = next((float(T) for T in period * _SHORTER ** np.arange(1, 60) if loop.mode(T)[0] <= 1.0 + _GROWTH), None)
     advice = "lower gains" if stable is None else f"a period below {stable:.3g} s, or lower gains"
     text = (
         f"control loop is unstable at its period of {period:.4g} s: each period multiplies deviations by {radius:.4g}. "
@@ -205,86 +216,52 @@ def _by_theory(scene: Scene, law: Law, period: float) -> tuple[Finding, ...]:
     return _finding(scene, int(np.argmax(sizes)), text, radius)
 
 
-def _by_turns(scene: Scene, x: Floats, u: Floats, t: Floats, period: float) -> tuple[Finding, ...]:
-    """The warning if a control of u (P, m) turns back every few periods, by much, as the state x (P, 2n) does."""
-    changes = np.diff(u, axis=0)
-    far = np.abs(changes) >= _SWING * np.ptp(u, axis=0)
-    turns = (changes[1:] * changes[:-1] < 0.0) & far[1:] & far[:-1]
-    worst = int(np.argmax([np.convolve(each, np.ones(_WINDOW)).max() for each in turns.T]))
-    at = np.flatnonzero(turns[:, worst])
-    if not np.convolve(turns[:, worst], np.ones(_WINDOW)).max() >= _TURNS:
+def _by_turns(scene: Scene, x: Floats, u: Floats, t: Floats, control: int, turns: Integers) -> tuple[Finding, ...]:
+    """The warning if a control of u (P, m) turns back every few periods as the state x (P, 2n) does."""
+    if not len(turns):
         return ()
     # What turns whatever the state is excitation, not feedback.
-    side, fit = np.sign(changes[at, worst]), np.column_stack([x[at + 1], np.ones(len(at))])
+    side, fit = np.sign(u[turns, control] - u[turns - 1, control]), np.column_stack([x[turns], np.ones(len(turns))])
     left = side - fit @ np.linalg.lstsq(fit, side, rcond=None)[0]
-    if not left @ left < (1.0 - _FOLLOWS) * (len(at) - x.shape[1]) * side.var():
+    if not left @ left < (1.0 - _FOLLOWS) * (len(turns) - x.shape[1]) * side.var():
         return ()
     text = (
-        f"{{}} turns back {len(at)} times in {len(u)} periods of {period:.4g} s: the law is too fast for "
+        f"{{}} turns back {len(turns)} times in {len(u)} periods of {t[1]:.4g} s: the law is too fast for "
         "its period. Use a shorter period, or lower gains"
     )
-    return _finding(scene, worst, text, float(len(at)), float(t[at[0] + 1]))
+    return _finding(scene, control, text, float(len(turns)), float(t[turns[0]]))
 
 
-def _by_growth(scene: Scene, trajectory: Trajectory, u: Floats, period: float) -> tuple[Finding, ...]:
-    """The warning if a control of u (P, m) grows exponentially and by much, and the controls do work in the end."""
-    quarters = np.array([part.max(axis=0, initial=0.0) for part in np.array_split(np.abs(u), 4)])
-    ratios = quarters[1:] / quarters[:-1]
-    grew = np.where((ratios >= 2.0).all(axis=0) & (ratios[2] >= 0.5 * ratios[0]), quarters[3] / quarters[0], 0.0)
-    late = trajectory.part(3 * trajectory.steps // 4, trajectory.steps)
-    work = (late.u / np.abs(late.u).max()) * (np.diff(late.q, axis=0) @ scene.actuation)
-    worst = int(np.argmax(grew))
-    if not grew[worst] >= _GREW or not work.sum() > 0.0:
-        return ()
-    text = (
-        f"control loop is unstable at its period of {period:.4g} s: {{}} grows by a factor of "
-        f"{grew[worst]:.3g}. Use a shorter period, or lower gains, or check the signs of the law"
-    )
-    return _finding(scene, worst, text, float(grew[worst]))
+def _at_equilibrium(scene: Scene, start: Floats, centre: Floats, u: Floats, H: Floats) -> Loop | None:
+    """The loop at the equilibrium that Newton's method finds from ``start`` (n,), None if it finds none.
 
-
-def loop_at_rest(scene: Scene, law: Law) -> Loop:
-    """The loop at the equilibrium that Newton's method finds from ``law.near``; if there is none, at ``law.near``."""
-    q = law.near
-    for _ in range(30):
-        try:
-            loop, off, way = _linearized(scene, law, nearest(scene, q) if scene.constraints else q)
-        except (AssemblyError, SingularMassMatrix):
-            break
-        if off <= NOTHING:
-            return loop
+    The law has the control u (m,) at the state ``centre`` (2n,) and the responses H (J, m, 2n) everywhere.
+    """
+    q, K = start, H.sum(axis=0)
+    for _ in range(_ITERATIONS):
+        q = nearest(scene, q) if scene.constraints else q
+        a, aq, av, af, Z = _at_rest(scene, q, scene.actuation @ (u + K @ (np.append(q, np.zeros_like(q)) - centre)))
+        pushed, responses = af @ scene.actuation, H @ np.kron(np.eye(2), Z)
+        way = Z @ np.linalg.lstsq(aq + pushed @ (K[:, : len(q)] @ Z), -a, rcond=_SINGULAR)[0]
+        if np.abs(way).max() < _CONVERGED:
+            A = np.block([[np.zeros_like(aq), np.eye(len(aq))], [aq, av]])
+            kept = float(np.vdot(H[-1], H[-2]) / np.vdot(H[-2], H[-2])) if len(H) == MEMORY else 0.0
+            return Loop(A, np.concatenate([np.zeros_like(pushed), pushed]), responses, min(max(kept, 0.0), 1.0))
         q = q + way / max(1.0, np.abs(way).max())
-    return _linearized(scene, law, law.near)[0]
+    return None
 
 
-def _linearized(scene: Scene, law: Law, q: Floats) -> tuple[Loop, float, Floats]:
-    """The loop at rest at q (n,), its acceleration as a share of its terms, and Newton's step to zero (n,)."""
-    n = len(q)
-    jet, (Kq, Kv, S) = lagrangian_jet(scene, q, np.zeros(n)), np.split(law.K, 3, axis=1)
-    force = scene.actuation @ (Kq @ q + S @ jet.Lq + law.c)
-    a, aq, av, af, Z, onto = _at_rest(scene, q, force)
-    pushed = af @ scene.actuation
-    A = np.block([[np.zeros_like(aq), np.eye(len(aq))], [aq, av]])
-    B = np.concatenate([np.zeros_like(pushed), pushed])
-    gains = np.concatenate([(Kq + S @ jet.Lqq) @ Z, Kv @ Z], axis=1)
-    way = Z @ np.linalg.lstsq(aq + pushed @ gains[:, : len(a)], -a, rcond=None)[0]
-    terms = np.abs(pushed) @ (np.abs(Kq) @ np.abs(q) + np.abs(law.c)) + np.abs(af) @ np.abs(jet.Lq)
-    off = float(np.abs(a).max(initial=0.0) / max(terms.max(initial=0.0), 1e-300))
-    known, sizes, _ = np.linalg.svd(np.concatenate([onto @ part for part in np.split(law.directions, 2)]), False)
-    return Loop(A, B, gains, known[:, sizes > NOTHING * sizes.max(initial=0.0)]), off, way
-
-
-def _at_rest(scene: Scene, q: Floats, force: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+def _at_rest(scene: Scene, q: Floats, force: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """The motion linearized at rest at q (n,) under a constant force (n,), in f coordinates y of its tangent space.
 
-    Accelerations of y (f,), their derivatives in y (f, f), in its rate (f, f) and in a force (f, n), and dq = Z dy,
-    dy' = onto dv, with Z'MZ = 1 and C Z = 0. The constraint forces C' lam are constant to first order in y, but for
+    Accelerations of y (f,), their derivatives in y (f, f), in its rate (f, f) and in a force (f, n), and dq = Z dy
+    with Z'MZ = 1 and C Z = 0. The constraint forces C' lam are constant to first order in y, but for
     their curvature lam . g_qq.
     """
     still = np.zeros((1, len(q)))
     a, aq, av, af = (part[0] for part in accelerations(scene, q[None], still, force[None]))
     if not scene.constraints:
-        return a, aq, av, af, np.eye(len(q)), np.eye(len(q))
+        return a, aq, av, af, np.eye(len(q))
     C = scene.core.constraints(np.ascontiguousarray(q[None]))[2][0]
     root = np.linalg.cholesky(af)
     left, sizes, right = np.linalg.svd(C @ root)
@@ -294,4 +271,4 @@ def _at_rest(scene: Scene, q: Floats, force: Floats) -> tuple[Floats, Floats, Fl
     a, aq, av, af = (part[0] for part in accelerations(scene, q[None], still, (force + C.T @ lam)[None]))
     onto = Z.T @ np.linalg.inv(af)
     curved = scene.core.constraint_curvature(q, lam, q)[0]
-    return onto @ a, onto @ (aq + af @ curved) @ Z, onto @ av @ Z, onto @ af, Z, onto
+    return onto @ a, onto @ (aq + af @ curved) @ Z, onto @ av @ Z, onto @ af, Z

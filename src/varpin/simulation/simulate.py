@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import logging
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,12 +19,12 @@ from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.signals.commands import open_loop
 from varpin.signals.controls import Controls, commands_of
-from varpin.signals.functions import ControlLaw, Sampled, copied, function_findings, require_law
+from varpin.signals.functions import ControlLaw, Sampled, copier, function_findings, require_law
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.check import check as checked
 from varpin.simulation.choice import given_integrator, usual_integrator
 from varpin.simulation.failures import Interrupted, StepFailure, named
-from varpin.simulation.loop import unstable_loop
+from varpin.simulation.loop import Gains, unstable_loop
 from varpin.simulation.record import MotionRecord, Progress, Reporter
 from varpin.simulation.start import (
     in_other_units,
@@ -37,6 +39,9 @@ logger = logging.getLogger(__name__)
 
 # Work between two progress calls and checks for Ctrl-C, in steps of one joint: some tens of milliseconds.
 _CHUNK = 30_000
+
+# The findings about the control loop of a motion.
+LoopCheck = Callable[[Trajectory], tuple[Finding, ...]]
 
 
 def simulate(
@@ -181,8 +186,10 @@ def simulate(
     state, (start,) = integrator.start(scene, q0[None], v0[None])
     held = commands.hold > 1 and not law
     record = MotionRecord(scene, integrator, dt, dw, start, commands if linear else None, held=held)
-    kept = copied(controls) if check and callable(controls) else None
-    interrupted = not _roll(record, state, steps, controls, commands, Reporter(progress, steps, dt), hold, check=check)
+    kept = copier(controls) if check and callable(controls) else None
+    fed = kept if law else Gains(commands.gains, integrator.variational)
+    loop = functools.partial(unstable_loop, scene, hold=hold, law=fed) if check and hold else None
+    interrupted = not _roll(record, state, steps, controls, commands, Reporter(progress, steps, dt), loop)
     motion = record.trajectory()
     known = None if interrupted else error
     try:
@@ -190,11 +197,13 @@ def simulate(
         if check:
             ended = interrupted and not isinstance(controls, Sampled)
             more = None if callable(controls) or ended else controls
-            motion = checked(scene, integrator, motion, more, known=known, hold=period if law else 0, law=kept)
-            loop = () if hold is None else unstable_loop(scene, motion, hold)
+            motion = checked(
+                scene, integrator, motion, more, known=known, hold=period if law else 0, law=kept and kept()
+            )
+            unstable = () if loop is None else loop(motion)
             wrong = [finding for finding in motion.warnings if finding.kind == "error"]
             unsettled = function_findings(controls) if isinstance(controls, Sampled) else ()
-            found = [*loop, *wrong, *unsettled, *found, *motion.warnings]
+            found = [*unstable, *wrong, *unsettled, *found, *motion.warnings]
         elif known is not None:
             motion = motion.with_error(known)
         # Values in wrong units explain all else. Without controls servos hold the start.
@@ -215,11 +224,9 @@ def _roll(
     controls: Controls | ControlLaw,
     commands: Commands,
     reporter: Reporter,
-    hold: int | None,
-    *,
-    check: bool,
+    loop: LoopCheck | None,
 ) -> bool:
-    """Integrate the steps of a motion with feedback every ``hold`` steps; False if Ctrl-C ended them."""
+    """Integrate the steps of a motion, with the check of its loop if there is one; False if Ctrl-C ended them."""
     scene = record.scene
     # The cost of a sweep is linear in the number of joints, that of an elimination cubic.
     n = scene.robot.dof
@@ -232,22 +239,19 @@ def _roll(
             done = record.steps
             segment = record.advance(state, controls, commands, 1 if stepwise else chunk, steps)
             if segment.failure is not None:
-                raise _step_failure(record, segment.failure, hold if check else None)
+                raise _step_failure(record, segment.failure, loop)
             reporter.add(segment, record.steps, due=done // chunk < record.steps // chunk)
     except KeyboardInterrupt:
         return False
     return True
 
 
-def _step_failure(record: MotionRecord, failure: Failure, hold: int | None) -> StepFailure:
-    """The error of a step that failed, its motion with a warning where an unstable control loop is the cause.
-
-    ``hold`` is the period of the loop in steps, None to leave it unchecked.
-    """
+def _step_failure(record: MotionRecord, failure: Failure, loop: LoopCheck | None) -> StepFailure:
+    """The error of a step that failed, its motion with a warning where an unstable control loop is the cause."""
     motion = record.trajectory()
-    found = () if hold is None else unstable_loop(record.scene, motion, hold)
+    found = () if loop is None else loop(motion)
     motion = motion.changed(warnings=found)
-    advice = found[0] if found else "Use a smaller dt" if hold is None else "Use a smaller dt, or lower gains"
+    advice = found[0] if found else "Use a smaller dt" if loop is None else "Use a smaller dt, or lower gains"
     return StepFailure(motion.steps, motion.t[-1], named(record.scene, failure), motion, advice)
 
 

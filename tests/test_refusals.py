@@ -1,4 +1,4 @@
-"""What problems, costs, searches, plans, controllers and policies refuse, by the names of their arguments."""
+"""What is refused, by the names of arguments: of robots, scenes, motions, problems, costs, searches, controllers."""
 
 import numpy as np
 import pytest
@@ -6,6 +6,7 @@ from plan_problems import CAPSULES, REST, SMALL, TWO, linear, reach, small, wave
 from refusals import refused
 
 import varpin as vp
+from varpin import wiener
 
 BEFORE = np.array([0.7, -0.3])
 BALL = vp.Obstacle.sphere([1.0, 0.0, 0.0], 0.1, name="ball")
@@ -131,6 +132,8 @@ OF_SEARCHES = [
     *((lambda x=x: SMALL["held"].plan.shifted(x), "decisions") for x in (-1, 12, 1.5)),
     *((lambda x=x: plan().verify(tolerance=x), "tolerance") for x in (0.0, -1.0, np.nan, "tight")),
     *((lambda x=x: plan().monte_carlo(x, 0), "paths") for x in (1, 0, 2.5)),
+    (lambda: vp.solve(reach(), SMALL["held"].plan, resume=SMALL["held"].plan), "resume"),
+    (lambda: vp.solve(reach(), resume=SMALL["held"].plan.trajectory), "Solution"),
 ]
 OF_CONTROLLERS = [
     (lambda: policy(previous_gains=np.eye(2)), ("previous_gains", "(3, 2, 2)", "(2, 2)")),
@@ -157,7 +160,127 @@ OF_CONTROLLERS = [
 ]
 
 
-@pytest.mark.parametrize(("make", "facts"), [*OF_PROBLEMS, *OF_COSTS, *OF_CONSTRAINTS, *OF_SEARCHES, *OF_CONTROLLERS])
+OF_TIMES = [
+    (lambda: small(dt=None, steps=None), "two of dt"),
+    (lambda: small(duration=1.0), "two of dt"),
+    (lambda: small(steps=None, duration=0.615), "0.615"),
+    *((lambda x=x: small(steps=None, duration=x), "duration") for x in (-1.0, np.nan, "1 s")),
+]
+
+
+def ur5(**options):
+    return lambda: vp.load_robot("ur5", **options)
+
+
+def loaded(**options):
+    return lambda: vp.load_robot("ur5", payload=vp.Payload(**{"frame": "tool0", "mass": 1.0} | options))
+
+
+def together(*robots, **options):
+    return lambda: vp.combine(TWO, *robots, **options)
+
+
+OF_ROBOTS = [
+    (ur5(keep="elbow_joint"), "keep"),
+    (ur5(keep={"elbow_joint": 0.0}), "keep"),
+    (ur5(keep=["elbow_joint"], lock={"elbow_joint": 0.1}), ("'elbow_joint'", "keep", "lock")),
+    (ur5(base="round"), ("base", "'planar'", "'round'")),
+    (ur5(base=np.eye(3)), ("base", "(3, 3)")),
+    (ur5(base=2.0 * np.eye(4)), ("base", "rotation")),
+    (ur5(base=np.diag([1.0, 1.0, -1.0, 1.0])), ("base", "rotation")),
+    (ur5(inertia="mesh"), ("inertia", "'file'", "'meshes'")),
+    (lambda: vp.load_robot(TWO.model, inertia="meshes"), "inertia"),
+    (ur5(inertia="meshes", density=0.0), "density"),
+    (loaded(frame="world"), ("'ur5'", "'world'")),
+    (loaded(mass=0.0), ("payload mass", "0.0")),
+    (loaded(center=[0.0, 1.0]), ("payload center", "(3,)", "(2,)")),
+    (loaded(inertia=[1.0, 1.0, 3.0]), ("payload inertia", "1, 1, 3")),
+    (loaded(inertia=2.0), ("payload inertia", "(3, 3)", "2")),
+    (loaded(inertia=[[1.0, 0.5, 0], [0, 1.0, 0], [0, 0, 1.0]]), ("payload inertia", "symmetric")),
+    (together(), "robots"),
+    (together("ur5"), "robots"),
+    (together(TWO, placements=[None]), ("placements", "2")),
+    (together(TWO, placements=[None, "planar"]), "base="),
+    (together(TWO, placements=[None, [2.0, 0.0, 0.0]]), ("placements", "'chain2'")),
+    (together(TWO, placements=[None, 2.0 * np.eye(4)]), "rotation"),
+    (together(TWO, prefixes="ab"), "prefixes"),
+    (together(TWO, prefixes=["", ""]), "'joint1'"),
+]
+# Three coordinates, two controls: one joint is not actuated, and a control moves two joints.
+ACTUATION = np.array([[1.0, 0.0], [0.0, 0.0], [0.5, 2.0]])
+
+
+def noisy(noise):
+    return lambda: vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=noise)
+
+
+def field(q, v, u):
+    return np.eye(3)
+
+
+OF_NOISE = [
+    (noisy(vp.AdditiveNoise([1.0, 2.0])), ("AdditiveNoise intensity", "(3,)", "(2,)")),
+    (noisy(vp.AdditiveNoise(np.ones((2, 4)))), ("AdditiveNoise intensity", "(3, 4)", "(2, 4)")),
+    (noisy(vp.ControlNoise(np.ones((3, 4, 3)))), ("ControlNoise intensity", "(3, 4, 2)")),
+    (noisy(vp.ControlNoise(np.full((3, 1, 2), np.nan))), ("ControlNoise intensity[0, 0, 0]", "nan")),
+    (noisy(3.0), ("noise", "3.0")),
+    (noisy([vp.AdditiveNoise(1.0), 0.5]), ("noise", "0.5")),
+    (noisy(vp.CustomNoise(field, 3.0)), ("CustomNoise processes", "3.0")),
+    (noisy(vp.CustomNoise(None, 3)), ("CustomNoise field", "None")),
+    (noisy(vp.CustomNoise(field, 3, dv=0.0)), "CustomNoise dv"),
+    (lambda: wiener.coarsen(np.zeros((9, 1)), 2), ("number", "9", "2")),
+    (lambda: wiener.coarsen(np.zeros(8)), ("increments", "(8,)")),
+    (lambda: wiener.wiener_increments(2, 0.1, 3, increments=np.zeros((3, 1))), ("(3, 2)", "(3, 1)")),
+    (lambda: wiener.wiener_increments(1, 0.1, 1, 0, np.zeros((1, 1))), ("rng", "increments")),
+]
+SCENE = vp.Scene(TWO)
+MOTION = vp.simulate(SCENE, REST, REST, dt=1e-3, steps=2)
+OTHER_Z = np.array([[0.0] * 4, [0.0, 0.0, np.nan, 0.0]])
+
+
+def moved(**controls):
+    return lambda: vp.simulate(SCENE, REST, REST, dt=1e-3, steps=5, **controls)
+
+
+OF_MOTIONS = [
+    *(
+        (lambda kind=kind, own=own: kind(**own), facts)
+        for kind in (vp.Gauss, vp.Radau)
+        for own, facts in (
+            ({"stages": 0}, ("stages", "1", "0")),
+            ({"stages": 7}, ("stages", "6", "7")),
+            ({"stages": 2.5}, ("stages", "2.5")),
+            ({"stages": "two"}, ("stages", "'two'")),
+            ({"guard": 3}, ("guard", "varpin.Guard", "None", "3")),
+        )
+    ),
+    (lambda: vp.Guard(max_halvings=31), ("max_halvings", "30", "31")),
+    (lambda: vp.Radau(kick="right"), ("kick", "'left'", "'split'", "'right'")),
+    (lambda: vp.CustomForce(np.zeros(3)), "function"),
+    (lambda: vp.CustomForce(lambda q, v: v, "exact"), "'exact'"),
+    (lambda: vp.Scene(TWO, gravity=-9.81), ("gravity", "(0, 0, -9.81)")),
+    (lambda: vp.second_order(SCENE, MOTION, np.zeros((3, 4))), ("z", "(2, 4)", "(3, 4)")),
+    (lambda: vp.second_order(SCENE, MOTION, OTHER_Z), ("z[1, 2]", "nan")),
+    *(
+        (lambda call=call, x=x: call(SCENE, x), ("motion", "varpin.Trajectory"))
+        for x in (None, np.zeros((3, 1)))
+        for call in (vp.linearize, lambda scene, motion: vp.second_order(scene, motion, np.zeros(4)))
+    ),
+    (lambda: vp.OpenLoop(lambda t, q, v: [0.0, 0.0]), ("(t, q, v)", "controls=law")),
+    (lambda: vp.OpenLoop(lambda: [0.0, 0.0]), ("OpenLoop", "time")),
+    (lambda: vp.OpenLoop([0.0, 0.0]), ("OpenLoop", "[0.0, 0.0]")),
+    (moved(controls=[0.1, 0.2], period=2), "period = 2"),
+    (moved(controls=vp.OpenLoop(lambda t: [0.1, 0.2]), period=2), "period = 2"),
+    *(
+        (lambda call=call, x=x: call(x), "path")
+        for x in (3, None, "a\0b", b"a")
+        for call in (MOTION.save, vp.Trajectory.load)
+    ),
+]
+TABLES = [OF_PROBLEMS, OF_COSTS, OF_CONSTRAINTS, OF_SEARCHES, OF_CONTROLLERS, OF_TIMES, OF_ROBOTS, OF_NOISE, OF_MOTIONS]
+
+
+@pytest.mark.parametrize(("make", "facts"), [row for table in TABLES for row in table])
 def test_it_is_refused(make, facts):
     with refused(vp.InputError, facts):
         make()

@@ -1,0 +1,209 @@
+"""Parameters from logs: found again, with right deviations, within what a body can have, and with what is not told."""
+
+import functools
+import logging
+
+import numpy as np
+import pytest
+from refusals import naming, refused
+
+import varpin as vp
+from varpin.estimation.consistency import Body
+from varpin.estimation.parameters import parameters_of
+
+DAMPING = np.array([2.0, 1.5, 1.0, 0.3, 0.2, 0.1])
+NOISE = 2e-4
+MIDDLE = np.array([0.0, -1.2, 1.2, -0.5, 0.5, 0.0])
+NAMES = ["damping", "payload"]
+
+
+def start(**options):
+    return vp.Scene(vp.load_robot("ur5"), damping=0.0, **options)
+
+
+@functools.cache
+def motion(late=0, damping=tuple(DAMPING), friction=0.0, duration=2.0):
+    """A UR5 with 2 kg under torques that are held for 10 ms, and act ``late`` ms later: by 1 ms steps of Gauss(3)."""
+    robot = vp.load_robot("ur5", payload=vp.Payload("tool0", 2.0))
+    scene = vp.Scene(robot, damping=damping, friction=friction)
+    rng, N = np.random.default_rng(4), round(duration / 1e-2)
+    phase, rate, size = rng.uniform(0, 6, (3, 6)), rng.uniform(0.3, 1.2, (3, 6)), rng.uniform(0.1, 0.4, (3, 6))
+
+    def law(t, q, v):
+        goal = MIDDLE + np.sum(size * np.sin(2.0 * np.pi * rate * t + phase), axis=0)
+        M = scene.core.jets(q[None], v[None])[0][0]
+        return scene.holding_torque(q) + M @ (100.0 * (goal - q) - 16.0 * v) + scene.damping * v
+
+    options = {"dt": 1e-3, "steps": 10 * N, "integrator": vp.Gauss(3), "check": False}
+    made = vp.simulate(scene, MIDDLE, np.zeros(6), controls=law, period=10, **options)
+    if late:
+        u = np.concatenate([np.repeat(made.u[:1], late, axis=0), made.u])[: 10 * N]
+        return vp.simulate(scene, MIDDLE, np.zeros(6), controls=u, **options).q[::10], made.u[
+            np.r_[0 : 10 * N : 10, -1]
+        ]
+    return made.q[::10], made.u[np.r_[0 : 10 * N : 10, -1]]
+
+
+def log(seed=0, noise=NOISE, **options):
+    q, u = motion(**options)
+    t = 1e-2 * np.arange(len(q))
+    return vp.Log(t, q + noise * np.random.default_rng(seed).standard_normal(q.shape), u)
+
+
+def within(found, truth, deviations=4.0):
+    return (np.abs(found.values - truth) <= deviations * found.deviations).all()
+
+
+TRUTH = np.append(DAMPING, 2.0)
+
+
+def test_dampers_and_payload_with_their_deviations():
+    found = vp.identify(start(), log(), NAMES, q_noise=NOISE, held_out=log(seed=1))
+    assert found.status == "converged"
+    assert not found.warnings
+    assert not found.null_space
+    assert within(found, TRUTH)
+    assert found.values[-1] == pytest.approx(2.0, rel=1e-3)
+    assert (found.deviations < 0.02 * TRUTH).all()
+    for residuals in (*found.residuals, *found.held_out):
+        assert np.sqrt(np.mean(residuals**2)) == pytest.approx(NOISE, rel=0.1)
+    before = np.sqrt(np.mean((found.logs[0].q - found.predicted_before[0]) ** 2))
+    assert before > 100.0 * NOISE
+    assert parameters_of(found.scene, NAMES).values[:6] == pytest.approx(found.values[:6])
+    assert found.scene.robot.tree.mass[-1] == pytest.approx(start().robot.tree.mass[-1] + found.values[-1])
+
+
+def test_deviations_are_those_of_many_logs():
+    found = [vp.identify(start(), log(seed), NAMES, q_noise=NOISE, delay=0.0) for seed in range(12)]
+    off = np.array([(each.values - TRUTH) / each.deviations for each in found])
+    # Of 84 numbers of deviation 1 the mean square is 1 +- 0.15.
+    assert np.mean(off**2) == pytest.approx(1.0, abs=0.5)
+
+
+def test_derivatives_of_what_is_minimized():
+    # The covariance of a linear problem is that of its derivatives: against differences of the minimum.
+    rows = []
+    for shift in (-1.0, 1.0):
+        q, u = motion()
+        moved = q.copy()
+        moved[37, 2] += shift * NOISE
+        at = vp.Log(1e-2 * np.arange(len(q)), moved, u)
+        rows.append(vp.identify(start(), at, NAMES, q_noise=NOISE, delay=0.0).values)
+    influence = (rows[1] - rows[0]) / 2.0
+    found = vp.identify(start(), log(noise=0.0), NAMES, q_noise=NOISE, delay=0.0)
+    assert (np.abs(influence) < found.deviations).all()
+    assert np.abs(influence / found.deviations).max() > 1e-3
+
+
+def test_a_delay_is_found_and_told():
+    found = vp.identify(start(), log(late=8), NAMES, q_noise=NOISE)
+    assert found.delay == pytest.approx(8e-3, abs=1e-4)
+    assert naming(found.warnings, "controls", "later")
+    assert within(found, TRUTH, 5.0)
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4(), vp.Gauss(2)], ids=str)
+def test_uneven_samples_and_missing_ones(integrator):
+    q, u = motion()
+    t, rng = 1e-2 * np.arange(len(q)), np.random.default_rng(2)
+    encoders = q + NOISE * rng.standard_normal(q.shape)
+    encoders[rng.random(q.shape) < 0.2] = np.nan
+    kept = np.sort(rng.choice(len(t), 170, replace=False))
+    # The controls stay those of each 10 ms, which are no longer all in the log: hold them.
+    keep = np.union1d(kept, np.flatnonzero(np.abs(np.diff(u, axis=0)).max(axis=1) > 0.0) + 1)
+    found = vp.identify(start(), vp.Log(t[keep], encoders[keep], u[keep]), NAMES, q_noise=NOISE, dt=5e-3,
+                        integrator=integrator)  # fmt: skip
+    assert within(found, TRUTH, 5.0)
+
+
+def test_prediction_errors_under_noise():
+    strength = 0.02
+    robot = vp.load_robot("ur5", payload=vp.Payload("tool0", 2.0))
+    scene = vp.Scene(robot, damping=DAMPING, noise=vp.AdditiveNoise(strength))
+    _, u = motion(duration=1.5)
+    shaken = vp.simulate(scene, MIDDLE, np.zeros(6), dt=1e-3, steps=1500, controls=np.repeat(u[:-1], 10, axis=0), rng=3,
+                         integrator=vp.Midpoint(kick="held"), check=False)  # fmt: skip
+    q = shaken.q[::10] + NOISE * np.random.default_rng(8).standard_normal(u.shape)
+    found = vp.identify(
+        start(noise=vp.AdditiveNoise(strength)), vp.Log(1e-2 * np.arange(len(q)), q, u), NAMES, q_noise=NOISE
+    )
+    assert within(found, TRUTH)
+    assert (found.deviations < 0.2 * TRUTH).all()
+
+
+def test_what_logs_do_not_tell():
+    names = ["damping", "payload:tool0", "payload:ee_link", "inertia:shoulder_link:m"]
+    found = vp.identify(start(), log(), names, q_noise=NOISE)
+    texts = sorted(found.null_space)
+    assert len(texts) == 2
+    assert "inertia:shoulder_link:m: the logs do not depend on it" in texts
+    # Two frames at one place: only the sum of the masses.
+    assert "only payload:" in "".join(texts)
+    assert np.isinf(found.deviations[6:]).all()
+    assert (np.abs(found.values[:6] - DAMPING) <= 4.0 * found.deviations[:6]).all()
+    assert found.values[6] + found.values[7] == pytest.approx(2.0, rel=1e-3)
+
+
+def test_bodies_stay_bodies():
+    numbers = parameters_of(start(), "inertia:forearm_link").values
+    body, rng = Body.around(numbers), np.random.default_rng(6)
+    assert body.numbers(np.zeros(10))[0] == pytest.approx(numbers, rel=1e-9, abs=1e-12)
+    for _ in range(20):
+        y = rng.normal(0.0, 2.0, 10)
+        values, slopes = body.numbers(y)
+        m, c = values[0], values[1:4] / values[0]
+        about = np.array([[values[4], values[5], values[7]], [values[5], values[6], values[8]],
+                          [values[7], values[8], values[9]]]) - m * (c @ c * np.eye(3) - np.outer(c, c))  # fmt: skip
+        moments = np.linalg.eigvalsh(about)
+        assert m > 0.0
+        assert moments[0] > 0.0
+        assert moments[2] < moments[:2].sum() * (1.0 + 1e-9)
+        shifts = np.array([body.numbers(y + 1e-6 * e)[0] - body.numbers(y - 1e-6 * e)[0] for e in np.eye(10)]).T / 2e-6
+        np.testing.assert_allclose(slopes, shifts, rtol=1e-5, atol=1e-6 * np.abs(shifts).max())
+
+
+def test_a_link_is_found_and_what_is_not_told_stays():
+    robot = vp.load_robot("ur5", payload=vp.Payload("forearm_link", 1.5, center=(0.0, 0.05, 0.2)))
+    truth = vp.Scene(robot, damping=DAMPING)
+    _, u = motion()
+    made = vp.simulate(truth, MIDDLE, np.zeros(6), dt=1e-3, steps=10 * (len(u) - 1), check=False,
+                       controls=np.repeat(u[:-1], 10, axis=0), integrator=vp.Gauss(3))  # fmt: skip
+    logged = vp.Log(1e-2 * np.arange(len(u)), made.q[::10], u)
+    scene = vp.Scene(vp.load_robot("ur5"), damping=DAMPING)
+    found = vp.identify(scene, logged, "inertia:forearm_link", q_noise=NOISE, delay=0.0)
+    q = np.random.default_rng(9).uniform(-2.0, 2.0, (5, 6))
+    for at in q:
+        assert found.scene.holding_torque(at) == pytest.approx(truth.holding_torque(at), abs=0.02)
+    assert np.abs(scene.holding_torque(q[0]) - truth.holding_torque(q[0])).max() > 1.0
+
+
+def test_a_wrong_log_is_told():
+    scene, right = start(), log()
+    swapped = right.q[:, [0, 1, 2, 3, 5, 4]]
+    found = vp.identify(scene, vp.Log(right.t, swapped, right.u), NAMES, q_noise=NOISE, evaluations=20)
+    assert naming(found.warnings, "q_noise")
+    named = [*scene.robot.joint_names[:4], *scene.robot.joint_names[:3:-1]]
+    again = vp.identify(scene, vp.Log(right.t, swapped, right.u, joints=named, controls=scene.robot.joint_names), NAMES,
+                        q_noise=NOISE)  # fmt: skip
+    assert within(again, TRUTH)
+
+
+def test_what_is_refused_and_interrupted(caplog):
+    scene, right = start(), log()
+    for wrong, facts in [({"q_noise": 0.0}, ("q_noise",)), ({"dt": -1.0}, ("dt",)), ({"horizon": 0.0}, ("horizon",))]:
+        with refused(vp.InputError, *facts):
+            vp.identify(scene, right, NAMES, **({"q_noise": NOISE} | wrong))
+    with refused(vp.InputError, "logs"):
+        vp.identify(scene, [], NAMES, q_noise=NOISE)
+    seen = []
+
+    def stop(evaluation, residual):
+        seen.append(residual)
+        if evaluation == 3:
+            raise KeyboardInterrupt
+
+    with caplog.at_level(logging.ERROR):
+        found = vp.identify(scene, right, NAMES, q_noise=NOISE, callback=stop)
+    assert found.status == "interrupted"
+    assert seen[-1] < seen[0]
+    assert found.values[-1] > 0.5
