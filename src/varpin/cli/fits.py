@@ -32,7 +32,7 @@ from varpin.support.tables import Table
 if TYPE_CHECKING:
     from varpin.estimation import Identification
 
-# Evaluations after which the bar of the progress grows: most searches take fewer.
+# The default of varpin.identify; after so many of all searches the bar of the progress grows.
 _EXPECTED = 100
 
 
@@ -54,13 +54,13 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
     noise.add_argument("--q-noise", nargs="+", required=True, metavar="X", help=text)
     text = "that of measured velocities [rad/s or m/s]; default: they are not used"
     noise.add_argument("--v-noise", nargs="+", metavar="X", help=text)
-    text = "by how much the controls act later than the logs say [s]; default: it is found, too"
-    parser.add_argument("--delay", type=float, metavar="S", help=text)
-    parser.add_argument("--dt", type=float, metavar="S", help="time step [s]; default: the usual one of the logs")
-    text = "length of the stretches that are simulated [s], inf for whole logs; default: 1"
-    parser.add_argument("--horizon", type=float, metavar="S", help=text)
-    text = "most evaluations of each search; default: 100"
-    parser.add_argument("--evaluations", type=int, metavar="N", help=text)
+    for name, kind, letter, text in (
+        ("delay", float, "S", "by how much the controls act later than the logs say [s]; default: it is found, too"),
+        ("dt", float, "S", "time step [s]; default: the usual one of the logs"),
+        ("horizon", float, "S", "length of the stretches that are simulated [s], inf for whole logs; default: 1"),
+        ("evaluations", int, "N", f"most evaluations of each search; default: {_EXPECTED}"),
+    ):
+        parser.add_argument(f"--{name}", type=kind, metavar=letter, help=text)
     add_integrator(parser, default="Gauss(stages=2)")
     begin = parser.add_argument_group("begin")
     add_gravity(begin)
@@ -75,11 +75,10 @@ def _identify(request: argparse.Namespace, errors: Console) -> int:
     files = files_of(request, ("save", (".urdf",), _save), ("plot", PICTURES, _plot))
     scene = _scene(request)
     logs, apart = ([Log.load(path) for path in paths] for paths in (request.logs, request.held_out))
-    options: dict[str, Any] = {name: getattr(request, name) for name in ("delay", "dt", "horizon")}
-    options |= {} if request.evaluations is None else {"evaluations": request.evaluations}
+    options: dict[str, Any] = {name: getattr(request, name) for name in ("delay", "dt", "horizon", "evaluations")}
     options |= {name: values_of(name.replace("_", "-"), getattr(request, name)) for name in ("q_noise", "v_noise")}
-    if request.integrator is not None:
-        options["integrator"] = integrator_of_words(request.integrator)
+    options["integrator"] = None if request.integrator is None else integrator_of_words(request.integrator)
+    options = {name: value for name, value in options.items() if value is not None}
     with request.interrupts.keeping():
         with progress_bar(errors, _EXPECTED, quiet=request.quiet, unit="evaluations") as progress:
             found = identify(
