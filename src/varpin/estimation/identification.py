@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
@@ -28,7 +29,7 @@ from varpin.finding import Finding, announce
 from varpin.integrators import Gauss, Integrator
 from varpin.integrators.base import Varied
 from varpin.linearization import linearize_steps
-from varpin.mechanics.scene import Scene, require_scene
+from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
 from varpin.model.urdf_output import save_urdf
 from varpin.signals.commands import open_loop
 from varpin.simulation.choice import given_integrator
@@ -189,10 +190,12 @@ def identify(
             the search with the best values so far.
 
     Raises:
-        InputError: A name stands for no parameter, a log does not fit the scene, or a value is out of its range.
+        InputError: A name stands for no parameter, a log does not fit the scene, the scene has constraints, or a value
+            is out of its range.
         UnknownJoint: A name is no joint of the robot.
     """
-    of = parameters_of(require_scene(scene), parameters)
+    refuse_constraints(require_scene(scene), "identify")
+    of = parameters_of(scene, parameters)
     given = (logs,) if isinstance(logs, Log | Trajectory) else tuple(logs)
     others = (held_out,) if isinstance(held_out, Log | Trajectory) else tuple(held_out)
     if not given:
@@ -206,6 +209,7 @@ def identify(
     runs = [_Run(fit, log) for log in matched]
     y, status, evaluation = np.zeros(fit.size), "converged", count("evaluations", evaluations)
     y[: len(of.names)] = fit.begin
+    fit.best = y
     try:
         if scene.processes:
             y, status = fit.search(partial(_predictions, fit, runs), y, _TIGHT, evaluation)
@@ -246,7 +250,7 @@ class _Fit:
         self.varied = of.varied()
         self.linear = not any(name.startswith("servo") for name in of.names)
         self.best, self.least, self.done = np.zeros(self.size), np.inf, 0
-        self.jacobian = np.zeros((0, self.size))
+        self.jacobian = np.zeros((1, self.size))
 
     @cached_property
     def begin(self) -> Floats:
@@ -576,7 +580,8 @@ def _made(fit: _Fit, y: Floats, runs: Sequence[_Run], apart: Sequence[_Run], sta
         delay_deviation=deviation, null_space=null, scene=scene, status=status,
         **{name: tuple(each) for name, each in motions.items()},
     )  # fmt: skip
-    found = tuple(_doubts(fit, made))
+    changes = np.zeros(P) if fit.of.scene.processes else _step_error(fit, runs, y)
+    found = tuple(_doubts(fit, made, changes))
     announce(logger, fit.of.scene.announced, fit.dt, found)
     return made.changed(warnings=(*found, *(each for run in runs for each in run.log.warnings)))
 
@@ -638,14 +643,40 @@ def _sentences(null: Floats, names: Sequence[str]) -> list[str]:
     return found
 
 
-def _doubts(fit: _Fit, made: Identification) -> list[Finding]:
+def _step_error(fit: _Fit, runs: Sequence[_Run], y: Floats) -> Floats:
+    """What half the step changes in the values (P,), to first order."""
+    finer = copy(fit)
+    finer.dt *= 0.5
+    prior, steps = [c for columns, _ in fit.bodies for c in columns], []
+    for each, of in ((fit, runs), (finer, [_Run(finer, run.log) for run in runs])):
+        each.least = np.inf
+        r, J = _simulations(each, [part for run in of for part in run.stretches()], y)
+        system = np.concatenate([J, np.eye(fit.size)[prior]]), np.concatenate([r, y[prior]])
+        steps.append(np.linalg.lstsq(*system, rcond=_NOTHING)[0])
+    change: Floats = fit.values(y)[1] @ (steps[0] - steps[1])
+    return change
+
+
+def _doubts(fit: _Fit, made: Identification, changes: Floats) -> list[Finding]:
     found = []
+    by_noise = np.divide(np.abs(changes), made.deviations, out=np.zeros_like(changes), where=made.deviations > 0.0)
+    k = int(np.argmax(by_noise))
+    if not by_noise[k] <= 1.0:
+        text = (
+            f"half the step changes {made.names[k]} by {changes[k]:.3g} {made.units[k]}, {by_noise[k]:.3g} standard "
+            "deviations: take a smaller dt or a method of higher order, such as varpin.Gauss(2)"
+        )
+        found.append(Finding("step", text, value=float(changes[k]), unit=made.units[k]))
     if made.status == "evaluations":
         found.append(Finding("evaluations", "the search ended at its most evaluations: evaluations= allows more"))
     squares = [np.square(own / fit.deviation) for own in made.residuals]
     with np.errstate(all="ignore"):
         by_joint = np.sqrt(np.nanmean(np.concatenate(squares), axis=0))
     worst = int(np.nanargmax(by_joint)) if np.isfinite(by_joint).any() else 0
+    over = np.sqrt(fit.least / len(fit.jacobian))
+    if fit.of.scene.processes and not over <= _MISFIT:
+        text = f"the innovations are {over:.3g} times what the scene's noise and q_noise explain: something else acts"
+        found.append(Finding("misfit", text, value=float(over)))
     if not by_joint[worst] <= _MISFIT and not fit.of.scene.processes:
         joint = fit.of.scene.robot.joint_names[worst]
         text = (
