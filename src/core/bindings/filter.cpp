@@ -44,7 +44,7 @@ Filtered filter(Model& model, std::size_t n, nb::handle log) {
     std::copy_n(field<In<2>>(log, "covariance", {d, d}), d * d, predicted_covariance.data());
     const auto [outcome, done] = [&] {
         nb::gil_scoped_release release;
-        return Filter<Model>(model, static_cast<int>(n), d > 2 * n)
+        return Filter<Model>(model, static_cast<int>(n), static_cast<int>(d))
             .run(view, {.predicted = predicted.data(),
                         .predicted_covariance = predicted_covariance.data(),
                         .state = state.data(),
