@@ -123,11 +123,13 @@ class Linearization:
         if self.constrained:
             raise InputError("process_covariance() is of scenes without constraints")
         n = self.B.shape[1] // 2
-        # F, or M^-1 F: the jump at the end of the step. The one at its start has become A jump by then.
-        late: Floats = self.F
-        if not self.variational:
-            late = np.asarray(np.linalg.solve(self.J[:, n:], self.K[:, n:] @ late), dtype=np.float64)
-        return white_covariance(self.A, late @ np.swapaxes(late, 1, 2), self.dt)
+        jump = self.F if self.variational else np.linalg.solve(self.J[:, n:], self.K[:, n:] @ self.F)  # M^-1 F
+        late = np.concatenate([np.zeros_like(jump), jump], axis=1)
+        early = self.A @ late
+        middle, change = 0.5 * (early + late), early - late
+        # The variance of a share of the step, even in [0, 1], is 1/12.
+        found: Floats = middle @ np.swapaxes(middle, 1, 2) + change @ np.swapaxes(change, 1, 2) / 12.0
+        return self.dt * found
 
 
 def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | None = None) -> Linearization:
@@ -214,21 +216,6 @@ def linearize_steps(
         Gramp[..., scene.prescribed] = Gu[..., scene.prescribed]
     F = np.broadcast_to(start.F[:, :, : scene.processes], (steps, n, scene.processes))
     return Linearization(A, B, K, Jk, F, G, Gx, Gu, trajectory.dt, integrator.variational, ramp, Gramp)
-
-
-def white_covariance(A: Floats, spread: Floats, dt: float) -> Floats:
-    """Covariances (N, 2n, 2n) of steps with derivatives A under white jumps of the state's second half.
-
-    ``spread`` (N, n, n) is their covariance in a unit of time. A jump at time s before the end of a step is taken to
-    reach it as the line, in s, from the jump itself to A times it: (K1).
-    """
-    n = spread.shape[1]
-    through = A[:, :, n:] @ spread
-    found: Floats = through @ np.swapaxes(A[:, :, n:], 1, 2)
-    found[:, :, n:] += 0.5 * through
-    found[:, n:] += 0.5 * np.swapaxes(through, 1, 2)
-    found[:, n:, n:] += spread
-    return (dt / 3.0) * found
 
 
 @dataclass(frozen=True, eq=False)

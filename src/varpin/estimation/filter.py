@@ -37,9 +37,6 @@ _ROUNDING = 1e-6
 # Steps between two samples that are too many: they take hours.
 _MOST = 1e9
 
-# The fields of an estimate that tell of the states.
-_STATES = ("q", "v", "covariance", "external", "external_covariance")
-
 
 @dataclass(frozen=True, eq=False)
 class Estimate(Frozen):
@@ -54,8 +51,8 @@ class Estimate(Frozen):
         external_covariance: Covariance of their errors (K, n, n), or None.
         innovations: Samples minus their predictions from the samples before (K, n) [rad or m], with those of measured
             velocities (K, 2n) [rad/s or m/s]; NaN where a sample is missing.
-        forward: Moments of the filter's state before and after each sample, and derivatives of predictions: (q, p) for
-            variational integrators and (q, v) for the others, then the external forces.
+        forward: Moments of the filter's state before and after each sample, and derivatives of predictions: of (q, p)
+            or (q, v), then of the external forces.
         given: What the filter was given, in the form of the core.
         joint_names: The joints of the columns.
         integrator: Whose steps these are, as text.
@@ -97,32 +94,32 @@ class Estimate(Frozen):
     @cached_property
     def gains(self) -> Floats:
         """Gains of the filter (K, d, z): what a unit of an innovation moves the state; 0 for missing samples."""
-        S, _, present = self._present
-        HP = self.forward.rows @ self.forward.predicted_covariance[:, : 2 * self.q.shape[1]]
-        return np.swapaxes(np.linalg.solve(S, HP * present[:, :, None]), 1, 2)
+        # P C' R^-1, with P after the sample, is (K2)'s gain.
+        CP = self.forward.rows @ self.forward.covariance[:, : 2 * self.q.shape[1]]
+        gains = np.swapaxes(CP, 1, 2) / self.given.variance
+        return np.where(np.isfinite(self.innovations)[:, None], gains, 0.0)
 
     @cached_property
-    def _present(self) -> tuple[Floats, Floats, np.ndarray[tuple[int, ...], np.dtype[np.bool_]]]:
-        """S with rows of the unit matrix and innovations with 0 for missing samples, and which are there."""
-        present = np.isfinite(self.innovations)
-        both = present[:, :, None] & present[:, None]
-        S = np.where(both, self.S, np.eye(present.shape[1]))
-        return S, np.where(present, self.innovations, 0.0), present
+    def _independent(self) -> tuple[Floats, Floats]:
+        """Innovations (K, z) as independent numbers of variance 1, 0 for missing ones; log sqrt det S (K,)."""
+        there = np.isfinite(self.innovations)
+        L = np.linalg.cholesky(np.where(there[:, :, None] & there[:, None], self.S, np.eye(there.shape[1])))
+        sizes = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
+        found: Floats = np.linalg.solve(L, np.nan_to_num(self.innovations)[:, :, None])[:, :, 0]
+        return found, sizes
 
     @cached_property
     def log_likelihood(self) -> float:
         """Logarithm of the density of all samples, given the start and the scene."""
-        S, _, present = self._present
-        bits = np.linalg.slogdet(S)[1].sum() + present.sum() * np.log(2.0 * np.pi)
-        return float(-0.5 * (self.nis().sum() + bits))
+        samples = np.isfinite(self.innovations).sum()
+        return float(-0.5 * (self.nis().sum() + samples * np.log(2.0 * np.pi)) - self._independent[1].sum())
 
     def nis(self) -> Floats:
         """Normalized squares of the innovations (K,): of as many degrees of freedom as a sample has numbers.
 
         Means far above that number tell of noise that is larger than given, or of a scene that is wrong.
         """
-        S, e, _ = self._present
-        return _squares(S, e)
+        return np.asarray((self._independent[0] ** 2).sum(axis=1))
 
     def nees(self, q: ArrayLike, v: ArrayLike) -> Floats:
         """Normalized squares of the errors of (q, v) against a known motion (K,): of 2n degrees of freedom.
@@ -135,7 +132,8 @@ class Estimate(Frozen):
             InputError: A shape is wrong, or a value is not finite.
         """
         off = [finite_array(name, x, own.shape) - own for name, x, own in (("q", q, self.q), ("v", v, self.v))]
-        return _squares(self.covariance, np.concatenate(off, axis=1))
+        e = np.concatenate(off, axis=1)[:, :, None]
+        return np.asarray((e * np.linalg.solve(self.covariance, e)).sum(axis=(1, 2)))
 
 
 def kalman_filter(
@@ -190,17 +188,20 @@ def kalman_filter(
             "noise=varpin.AdditiveNoise(intensity)) says how strong the forces are that it does not know"
         )
     joints, n = scene.robot.joint_names, scene.robot.dof
-    measured, variance = _measured(log, q_noise, v_noise)
-    q, *start = _first_samples(log, variance[:n])
-    for at, (name, given) in enumerate({"q0": q0, "v0": v0}.items()):
-        start[at] = start[at] if given is None else joint_array(name, given, joints)
+    measured, variance = log.q, variances("q_noise", q_noise, joints)
+    q, first, rate, P = _first_samples(log, variance)
+    if v_noise is not None:
+        if log.v is None:
+            raise InputError("v_noise is given, and the log has no velocities v")
+        measured = np.concatenate([log.q, log.v], axis=1)
+        variance = np.concatenate([variance, variances("v_noise", v_noise, joints)])
+    first = first if q0 is None else joint_array("q0", q0, joints)
+    rate = rate if v0 is None else joint_array("v0", v0, joints)
     if covariance is not None:
-        start[2] = require_covariance(finite_array("covariance", covariance, (2 * n, 2 * n)))
+        P = require_covariance(finite_array("covariance", covariance, (2 * n, 2 * n)))
     parts, h = _steps(log.t, dt)
-    integrator = given_integrator(integrator)
-    if integrator is None:
-        integrator = usual_integrator(scene, start[0], start[1], float(h.max()), noisy=False)
-    mean, P = _of_state(scene, *start, variational=integrator.variational)
+    method = given_integrator(integrator) or usual_integrator(scene, first, rate, float(h.max()), noisy=False)
+    mean, P = _of_state(scene, first, rate, P, variational=method.variational)
     strength, kept = np.zeros(n), np.zeros(len(h))
     if external is not None:
         strength, kept = _external(external, joints, h)
@@ -208,11 +209,13 @@ def kalman_filter(
     F = scene.noise.fields(q[:-1], np.zeros_like(q[:-1]), log.u[:-1], q[0]).F
     force, spread = log.u[:-1] @ scene.actuation.T, F @ np.swapaxes(F, 1, 2)
     added = (1.0 - kept[:, None] ** 2) * strength
-    seen = FilterLog(mean, P, measured, variance, parts, h, *map(np.ascontiguousarray, (force, spread, kept, added)))
-    found = integrator.filtered(scene, seen)
-    states = _in_velocities(scene, found.state, found.covariance, variational=integrator.variational)
-    text, variational = str(integrator), integrator.variational
-    return Estimate(log.t, *states, found, seen, joints, text, variational, warnings=log.warnings)
+    seen = FilterLog(mean, P, measured, variance, parts, h, force, spread, kept, added)
+    found = method.filtered(scene, seen)
+    states = _in_velocities(scene, found.state, found.covariance, variational=method.variational)
+    return Estimate(
+        log.t, **states, forward=found, given=seen, joint_names=joints, integrator=str(method),
+        variational=method.variational, warnings=log.warnings,
+    )  # fmt: skip
 
 
 def smooth(scene: Scene, log: Log | Trajectory, *, q_noise: JointValues, **options: Any) -> Estimate:
@@ -223,19 +226,7 @@ def smooth(scene: Scene, log: Log | Trajectory, *, q_noise: JointValues, **optio
     """
     found = kalman_filter(scene, log, q_noise=q_noise, **options)
     states = _in_velocities(scene, *_backward(found.forward), variational=found.variational)
-    return found.changed(**dict(zip(_STATES, states, strict=True)), smoothed=True)
-
-
-def _measured(log: Log, q_noise: JointValues, v_noise: JointValues | None) -> tuple[Floats, Floats]:
-    """The samples (K, z) of a log in the robot's order, and the variances (z,) of their errors."""
-    joints = log.joints or ()
-    variance = variances("q_noise", q_noise, joints)
-    if v_noise is None:
-        return np.ascontiguousarray(log.q), variance
-    if log.v is None:
-        raise InputError("v_noise is given, and the log has no velocities v")
-    both = np.ascontiguousarray(np.concatenate([log.q, log.v], axis=1))
-    return both, np.concatenate([variance, variances("v_noise", v_noise, joints)])
+    return found.changed(**states, smoothed=True)
 
 
 def variances(name: str, value: JointValues, joints: tuple[str, ...]) -> Floats:
@@ -290,22 +281,20 @@ def _of_state(scene: Scene, q: Floats, v: Floats, P: Floats, *, variational: boo
     return np.concatenate([q, M @ v]), to @ P @ to.T
 
 
-def _in_velocities(
-    scene: Scene, x: Floats, P: Floats, *, variational: bool
-) -> tuple[Floats, Floats, Floats, Floats | None, Floats | None]:
-    """q, v, their covariance, and external forces with theirs, from moments (K, d), (K, d, d) of the filter's state."""
+def _in_velocities(scene: Scene, x: Floats, P: Floats, *, variational: bool) -> dict[str, Any]:
+    """The states of an estimate from moments (K, d), (K, d, d) of the filter's state."""
     n = scene.robot.dof
     q, v, covariance = x[:, :n].copy(), x[:, n : 2 * n].copy(), P[:, : 2 * n, : 2 * n].copy()
     if variational:
         M, _ = node_jets(scene, q, v)
         v = np.ascontiguousarray(np.linalg.solve(M, v[:, :, None])[:, :, 0])
-        lower = velocity_at_nodes(scene, q, v)
-        cross = lower @ covariance
-        covariance[:, n:, :n] = cross[:, :, :n]
-        covariance[:, :n, n:] = np.swapaxes(cross[:, :, :n], 1, 2)
-        covariance[:, n:, n:] = cross @ np.swapaxes(lower, 1, 2)
-    more = x.shape[1] > 2 * n
-    return q, v, covariance, *((x[:, 2 * n :], P[:, 2 * n :, 2 * n :]) if more else (None, None))
+        to = np.tile(np.eye(2 * n), (len(q), 1, 1))
+        to[:, n:] = velocity_at_nodes(scene, q, v)
+        covariance = to @ covariance @ np.swapaxes(to, 1, 2)
+    states = {"q": q, "v": v, "covariance": covariance, "external": None, "external_covariance": None}
+    outer = slice(2 * n, None)
+    more = {"external": x[:, outer], "external_covariance": P[:, outer, outer]} if x.shape[1] > 2 * n else {}
+    return states | more
 
 
 def _backward(found: FilterArrays) -> tuple[Floats, Floats]:
@@ -319,11 +308,3 @@ def _backward(found: FilterArrays) -> tuple[Floats, Floats]:
         x[k] += back[k] @ (x[k + 1] - found.predicted[k + 1])
         P[k] += back[k] @ (P[k + 1] - before[k]) @ back[k].T
     return x, 0.5 * (P + np.swapaxes(P, 1, 2))
-
-
-def _squares(S: Floats, e: Floats) -> Floats:
-    """The e' S^-1 e of each row, in units of the deviations."""
-    scale = np.sqrt(np.diagonal(S, axis1=1, axis2=2))
-    scaled, y = S / (scale[:, :, None] * scale[:, None]), e / scale
-    found: Floats = np.einsum("Ki,Ki->K", y, np.linalg.solve(scaled, y[:, :, None])[:, :, 0])
-    return found

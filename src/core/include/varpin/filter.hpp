@@ -13,112 +13,22 @@
 
 namespace varpin {
 
-// A log of K samples of z numbers, positions and then velocities if there are any, and what acts in its K - 1
-// intervals.
+// A log of K samples of z numbers, and what acts in its K - 1 intervals: FilterLog of src/varpin/core/arrays.py.
 struct LogView {
     std::int64_t samples = 0;
-    int rows = 0;                         // z: n or 2n
-    const double* measured = nullptr;     // (K, z), NaN where missing
-    const double* variance = nullptr;     // (z)
-    const std::int64_t* parts = nullptr;  // (K - 1) steps in an interval
-    const double* h = nullptr;            // (K - 1) their length [s]
-    const double* force = nullptr;        // (K - 1, n) of the controls
-    const double* spread = nullptr;       // (K - 1, n, n) F F' of the noise
-    const double* kept = nullptr;         // (K - 1) share of external forces that a step keeps
-    const double* added = nullptr;        // (K - 1, n) variance that it adds to them
+    int rows = 0;  // z
+    const double *measured = nullptr, *variance = nullptr;
+    const std::int64_t* parts = nullptr;
+    const double *h = nullptr, *force = nullptr, *spread = nullptr, *kept = nullptr, *added = nullptr;
 };
 
-// Moments (K, d) and (K, d, d) of the state before and after each sample, for d = 2n, or 3n with external forces.
+// FilterArrays of the same file, in zeros. The moments of the first prediction are given.
 struct Estimates {
-    double *predicted = nullptr, *predicted_covariance = nullptr;  // those of the first sample are given
-    double *state = nullptr, *covariance = nullptr;
-    double* transition = nullptr;   // (K - 1, d, d) derivative of a prediction in the state before
-    double* innovations = nullptr;  // (K, z), NaN where missing
-    double* rows = nullptr;         // (K, z, 2n) derivatives of the predicted samples in the state
+    double *predicted = nullptr, *predicted_covariance = nullptr, *state = nullptr, *covariance = nullptr;
+    double *transition = nullptr, *innovations = nullptr, *rows = nullptr;
 };
 
-namespace detail {
-
-// out (rows, columns) = a (rows, depth) b (depth, columns).
-inline void multiply(const double* a, const double* b, int rows, int depth, int columns, double* out) {
-    std::fill(out, out + rows * columns, 0.0);
-    for (int i = 0; i < rows; ++i) {
-        subtract_rows(
-            out + i * columns, columns, 0, depth, [&](int k) { return -a[i * depth + k]; },
-            [&](int k) { return b + k * columns; });
-    }
-}
-
-// Of a (n, n), in place.
-inline void transpose(double* a, int n) {
-    for (int i = 0; i < n; ++i) {
-        for (int j = 0; j < i; ++j) std::swap(a[i * n + j], a[j * n + i]);
-    }
-}
-
-}  // namespace detail
-
-// Steps of a variational integrator in (q, p).
-class VariationalModel {
-  public:
-    VariationalModel(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                     const Kernels& kernels)
-        : steps_(mechanism, tableau, tolerance, guards, kernels), n_(mechanism.dof()) {}
-
-    // Takes x (2n) to the end of a step, with its derivatives A in x and B in the external force (n), which may be
-    // null, and `spread` (n, n), that of the noise's forces in a unit of time, to that of its jumps.
-    Outcome step(double h, double* x, const double* force, const double* external, double* A, double* B, double*) {
-        steps_.take_external(external);
-        return steps_.step(h, x, x + n_, force, A, B, x, x + n_);
-    }
-
-    // The velocity (n) at x and its derivatives, into zeros (n, 2n); false where the mass matrix is not positive
-    // definite.
-    bool velocity(const double* x, double* v, double* slopes) { return steps_.velocity(x, x + n_, v, slopes); }
-
-  private:
-    VariationalLinearization steps_;
-    int n_;
-};
-
-// The same of an explicit method in (q, v).
-class ExplicitModel {
-  public:
-    ExplicitModel(const Mechanism& mechanism, ExplicitMethod method)
-        : stepper_(mechanism, method, true), n_(mechanism.dof()), sum_(n_) {}
-
-    Outcome step(double h, double* x, const double* force, const double* external, double* A, double* B,
-                 double* spread) {
-        std::copy_n(x, n_, stepper_.q.begin());
-        std::copy_n(x + n_, n_, stepper_.v.begin());
-        if (!stepper_.dynamics.at(x, x + n_)) return Outcome::singular;
-        for (int turn = 0; turn < 2; ++turn) {
-            // M^-1 times the rows of a symmetric matrix, and then of the transpose of that.
-            for (int i = 0; i < n_; ++i) stepper_.dynamics.solve_mass(spread + i * n_, spread + i * n_);
-            detail::transpose(spread, n_);
-        }
-        for (int i = 0; i < n_; ++i) sum_[i] = force[i] + (external ? external[i] : 0.0);
-        if (!stepper_.step(h, sum_.data())) return Outcome::singular;
-        std::fill_n(A, 4 * n_ * n_, 0.0);
-        std::fill_n(B, 2 * n_ * n_, 0.0);
-        stepper_.write_derivatives(h, A, B);
-        std::copy_n(stepper_.q.begin(), n_, x);
-        std::copy_n(stepper_.v.begin(), n_, x + n_);
-        return Outcome::solved;
-    }
-
-    bool velocity(const double* x, double* v, double* slopes) {
-        std::copy_n(x + n_, n_, v);
-        for (int i = 0; i < n_; ++i) slopes[i * 2 * n_ + n_ + i] = 1.0;
-        return true;
-    }
-
-  private:
-    ExplicitStepper stepper_;
-    int n_;
-    std::vector<double> sum_;
-};
-
+// By the steps of a VariationalLinearization or an ExplicitStepper.
 template <class Model>
 class Filter {
   public:
