@@ -108,14 +108,9 @@ class Linearization:
     def process_covariance(self) -> Floats:
         """Covariance (N, 2n, 2n) that white forces of the intensities F add to the state in each step.
 
-        It is that of the continuous equation, equation (K1) of docs/mathematics.md, whatever the integrator draws:
-        the force of the noise moves q within the step, so that the covariance has rank 2n, while a single increment a
-        step has rank n and makes a filter overconfident. To leading order it is, for x = (q, p),
-
-            [[dt^3/3 M^-1 FF' M^-1, dt^2/2 M^-1 FF'], [dt^2/2 FF' M^-1, dt FF']]
-
-        For a damper of rate l (1/s) the variance of q is too small by the share l dt / 4, and for l dt above 1 that of
-        the second half is too large; smaller steps are right.
+        It is that of the continuous equation, (K1) of docs/mathematics.md, whatever the integrator draws: of rank 2n,
+        while a single increment a step has rank n and makes a filter overconfident. For a damper of rate l (1/s) the
+        variance of q is too small by the share l dt / 4, and for l dt above 1 that of the second half is too large.
 
         Raises:
             InputError: The scene has constraints.

@@ -5,7 +5,7 @@ Equations (K1) and (K2) of docs/mathematics.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -65,13 +65,13 @@ class Estimate(Frozen):
     q: Floats
     v: Floats
     covariance: Floats
-    external: Floats | None
-    external_covariance: Floats | None
-    forward: FilterArrays = field(repr=False)
-    given: FilterLog = field(repr=False)
+    forward: FilterArrays
+    given: FilterLog
     joint_names: tuple[str, ...]
     integrator: str
     variational: bool
+    external: Floats | None = None
+    external_covariance: Floats | None = None
     smoothed: bool = False
     warnings: tuple[Finding, ...] = ()
 
@@ -104,9 +104,8 @@ class Estimate(Frozen):
         """Innovations (K, z) as independent numbers of variance 1, 0 for missing ones; log sqrt det S (K,)."""
         there = np.isfinite(self.innovations)
         L = np.linalg.cholesky(np.where(there[:, :, None] & there[:, None], self.S, np.eye(there.shape[1])))
-        sizes = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
-        found: Floats = np.linalg.solve(L, np.nan_to_num(self.innovations)[:, :, None])[:, :, 0]
-        return found, sizes
+        e = np.linalg.solve(L, np.nan_to_num(self.innovations)[:, :, None])[:, :, 0]
+        return np.asarray(e), np.asarray(np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1))
 
     @cached_property
     def log_likelihood(self) -> float:
@@ -164,8 +163,7 @@ def kalman_filter(
             momentum observer for encoders alone.
 
     Other Args:
-        dt: Longest step [s]: each interval of the log is covered by equal steps. If left out, one step from sample to
-            sample, and more over gaps.
+        dt: Longest step [s] of the equal ones in an interval; if left out, they have one each, and more in gaps.
         q0: Mean of the position at the first sample [rad or m]; if left out, that sample.
         v0: Mean of the velocity there [rad/s or m/s]; if left out, the difference of the first two samples.
         covariance: Covariance of (q0, v0) (2n, 2n); if left out, a hundred times the standard deviations of the first
@@ -212,10 +210,8 @@ def kalman_filter(
     seen = FilterLog(mean, P, measured, variance, parts, h, force, spread, kept, added)
     found = method.filtered(scene, seen)
     states = _in_velocities(scene, found.state, found.covariance, variational=method.variational)
-    return Estimate(
-        log.t, **states, forward=found, given=seen, joint_names=joints, integrator=str(method),
-        variational=method.variational, warnings=log.warnings,
-    )  # fmt: skip
+    own: dict[str, Any] = {"joint_names": joints, "integrator": str(method), "variational": method.variational}
+    return Estimate(log.t, forward=found, given=seen, warnings=log.warnings, **own, **states)
 
 
 def smooth(scene: Scene, log: Log | Trajectory, *, q_noise: JointValues, **options: Any) -> Estimate:
@@ -284,26 +280,22 @@ def _of_state(scene: Scene, q: Floats, v: Floats, P: Floats, *, variational: boo
 def _in_velocities(scene: Scene, x: Floats, P: Floats, *, variational: bool) -> dict[str, Any]:
     """The states of an estimate from moments (K, d), (K, d, d) of the filter's state."""
     n = scene.robot.dof
-    q, v, covariance = x[:, :n].copy(), x[:, n : 2 * n].copy(), P[:, : 2 * n, : 2 * n].copy()
+    q, v, more = (part.copy() for part in np.split(x, [n, 2 * n], axis=1))
+    covariance, of_more = P[:, : 2 * n, : 2 * n].copy(), P[:, 2 * n :, 2 * n :]
     if variational:
-        M, _ = node_jets(scene, q, v)
-        v = np.ascontiguousarray(np.linalg.solve(M, v[:, :, None])[:, :, 0])
+        v = np.asarray(np.linalg.solve(node_jets(scene, q, v)[0], v[:, :, None])[:, :, 0])
         to = np.tile(np.eye(2 * n), (len(q), 1, 1))
         to[:, n:] = velocity_at_nodes(scene, q, v)
         covariance = to @ covariance @ np.swapaxes(to, 1, 2)
-    states = {"q": q, "v": v, "covariance": covariance, "external": None, "external_covariance": None}
-    outer = slice(2 * n, None)
-    more = {"external": x[:, outer], "external_covariance": P[:, outer, outer]} if x.shape[1] > 2 * n else {}
-    return states | more
+    known = {"q": q, "v": v, "covariance": covariance}
+    return known | ({"external": more, "external_covariance": of_more} if more.size else {})
 
 
 def _backward(found: FilterArrays) -> tuple[Floats, Floats]:
     """Smoothed moments (K, d), (K, d, d) of the filter's state."""
     x, P = found.state.copy(), found.covariance.copy()
-    before, ahead = found.predicted_covariance[1:], found.transition @ P[:-1]
-    # In units of the deviations: momenta of light joints are 1e-6 and less.
-    scale = np.sqrt(np.diagonal(before, axis1=1, axis2=2))[:, :, None]
-    back = np.swapaxes(np.linalg.solve(before / (scale * np.swapaxes(scale, 1, 2)), ahead / scale) / scale, 1, 2)
+    before = found.predicted_covariance[1:]
+    back = np.swapaxes(np.linalg.solve(before, found.transition @ P[:-1]), 1, 2)
     for k in range(len(x) - 2, -1, -1):
         x[k] += back[k] @ (x[k + 1] - found.predicted[k + 1])
         P[k] += back[k] @ (P[k + 1] - before[k]) @ back[k].T
