@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -224,12 +225,13 @@ def _from_csv(source: Path) -> dict[str, Any]:
     if not is_file(source):
         raise FileError(f"there is no file {source}")
     try:
-        with source.open(encoding="utf-8-sig") as stream:
+        # NumPy warns of a file without rows.
+        with warnings.catch_warnings(action="error"), source.open(encoding="utf-8-sig") as stream:
             # Names as they are: NumPy would take signs out of them. Text that is no number is refused.
             table = np.genfromtxt(
                 stream, delimiter=",", names=True, autostrip=True, deletechars="", replace_space=" ", loose=False
             )
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, UserWarning) as error:
         raise FileError(f"cannot read {source}: {error}") from None
     names = table.dtype.names or ()
     of = {kind: tuple(name[2:] for name in names if name.startswith(f"{kind}_")) for kind in "quv"}
