@@ -134,7 +134,7 @@ def sensitivities(
 ) -> Sensitivities:
     """Exact derivatives of a motion in parameters of its scene.
 
-    They are those of the discrete map, step by step beside the linearization: x_theta' = A x_theta + dx'/dtheta, where
+    They are those of the discrete map, (L5), step by step beside the linearization: x_theta' = A x_theta + dx'/dtheta, where
     dx'/dtheta solves the factored step equation of A and B.
 
     Main args:
