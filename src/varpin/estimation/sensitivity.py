@@ -134,8 +134,8 @@ def sensitivities(
 ) -> Sensitivities:
     """Exact derivatives of a motion in parameters of its scene.
 
-    They are those of the discrete map, (L5), step by step beside the linearization: x_theta' = A x_theta + dx'/dtheta, where
-    dx'/dtheta solves the factored step equation of A and B.
+    They are those of the discrete map, (L5), step by step beside the linearization: x_theta' = A x_theta + dx'/dtheta,
+    where dx'/dtheta solves the factored step equation of A and B.
 
     Main args:
         scene: The scene of the motion; constraints and kinematic inputs are no obstacle.
