@@ -193,6 +193,10 @@ def test_what_is_refused_and_interrupted(caplog):
     for wrong, facts in [({"q_noise": 0.0}, ("q_noise",)), ({"dt": -1.0}, ("dt",)), ({"horizon": 0.0}, ("horizon",))]:
         with refused(vp.InputError, *facts):
             vp.identify(scene, right, NAMES, **({"q_noise": NOISE} | wrong))
+    dead = right.q.copy()
+    dead[:, 4] = dead[0, 4]
+    with refused(vp.InputError, "wrist_2_joint", "encoder"):
+        vp.identify(scene, vp.Log(right.t, dead, right.u), NAMES, q_noise=NOISE)
     with refused(vp.InputError, "logs"):
         vp.identify(scene, [], NAMES, q_noise=NOISE)
     seen = []
