@@ -10,7 +10,10 @@ from findings import about
 from oracles import exact
 
 import varpin as vp
+from varpin.control.search import Search
+from varpin.control.solving import _gentler
 from varpin.mechanics.forces import drive_forces
+from varpin.simulation.choice import STIFF
 from varpin.simulation.spectrum import rate_at_rest
 
 
@@ -68,7 +71,7 @@ def test_problems_take_an_integrator_that_friction_is_not_too_fast_for():
 
 def test_verification_under_friction_that_is_too_fast_for_explicit_steps():
     rough = problem(2e-4)
-    plan = vp.solve(rough, max_iterations=15)
+    plan = vp.solve(rough)
     found = plan.verify(tolerance=1e-5, max_substeps=256)
     assert found.integrator == str(vp.Radau(3))
     assert found.told
@@ -79,6 +82,62 @@ def test_verification_under_friction_that_is_too_fast_for_explicit_steps():
     q, v = motion.q[-1], motion.v[-1]
     true = rough.dt * 1e-2 * (u**2).sum() + 1e3 * ((q - [0.6, -0.4]) ** 2).sum() + 10.0 * (v**2).sum()
     assert found.open_loop_cost == pytest.approx(true, rel=1e-4)
+
+
+def arm(name, width=0.01, goal=0.4, **options):
+    robot = vp.load_robot(name)
+    q0 = np.full(robot.dof, 0.3)
+    cost = vp.ControlCost(1e-3) + vp.VelocityCost(1e-2)
+    cost += vp.Terminal(vp.TrackingCost(q0 + goal, 1e3) + vp.VelocityCost(100.0))
+    scene = vp.Scene(robot, forces=vp.CoulombFriction(0.2, width))
+    limits = -robot.effort_limit, robot.effort_limit
+    given = {"dt": 0.02, "steps": 50, "control_limits": limits, "constraints": [vp.WithinVelocityLimits(robot)]}
+    return vp.OptimalControlProblem(scene, cost, q0, np.zeros(robot.dof), **given | options)
+
+
+@pytest.mark.parametrize("name", ["xarm7", "ur5"])
+def test_plans_come_to_sharp_friction_from_wide_friction(name):
+    sharp = arm(name)
+    plan, wide = (vp.solve(own, max_iterations=60, check=False) for own in (sharp, arm(name, 0.05)))
+    assert plan.violation <= 1e-6
+    # Wider friction is no stronger at any speed.
+    assert 0.97 * wide.cost < plan.cost < 1.1 * wide.cost
+    # The goal is reached in steps of a tenth, too, which resolve the friction better.
+    fine = vp.simulate(
+        sharp.scene,
+        sharp.q0,
+        sharp.v0,
+        dt=2e-3,
+        steps=500,
+        controls=np.repeat(plan.controls, 10, axis=0),
+        integrator=vp.Radau(3),
+    )
+    assert np.abs(fine.q[-1] - plan.trajectory.q[-1]).max() < 0.05
+
+
+def test_friction_is_widened_until_the_step_resolves_it():
+    assert _gentler(arm("xarm7").at(dt=1e-5, steps=3)) == []
+    assert _gentler(problem(0.1)) == []
+    sharp = problem(2e-4)
+    row = _gentler(sharp)
+    rates = [sharp.dt * rate_at_rest(own.scene, sharp.q0) / STIFF for own in (*row, sharp)]
+    assert 1 / 3 < rates[0] <= 1.0 < rates[1]
+    assert np.diff(np.log(rates)) == pytest.approx(np.log(3.0))
+    assert {own.values[0] for one in row for own in one.scene.elements} == {0.5}
+
+
+def test_ctrl_c_under_wider_friction_returns_a_motion(monkeypatch):
+    def stopped(self, *options):
+        if self.problem.scene is not sharp.scene:
+            raise KeyboardInterrupt
+        return run(self, *options)
+
+    sharp, run = problem(2e-4), Search.run
+    monkeypatch.setattr(Search, "run", stopped)
+    plan = vp.solve(sharp, check=False)
+    assert plan.status is vp.Status.INTERRUPTED
+    assert plan.problem is sharp
+    assert len(plan.history) == 1
 
 
 def test_noise_beyond_the_width_of_friction_is_reported():

@@ -58,8 +58,8 @@ _PATIENCE = 10
 # Weight of the rows in the merit: this many times the largest multiplier, and at most _HEAVY times, as heavy rows
 # shorten steps; where rows cannot all be met, this many times what the cost is per violation. From 3 to 100.
 _ABOVE, _HEAVY = 1.5, 10.0
-# Greatest number of halvings of a trial's steps beyond those that the present motion needs; from 2 to 6.
-_HALVINGS = 4
+# Greatest number of halvings of a trial's steps beyond those that the present motion needs; from 3 to 7.
+_HALVINGS = 5
 
 
 class Step(NamedTuple):
@@ -183,7 +183,7 @@ class Search:
             longest = max(longest, time.perf_counter() - started)
             if taken.length == 0.0 and self.violation <= FEASIBLE and taken.last.shares is not None:
                 hidden = self.along.rounding(self.shares, taken.last.shares)
-                if step.decrease <= hidden:
+                if abs(step.decrease) <= hidden:
                     if self._goes_on(Status.CONVERGED):
                         continue
                     self.reason = f"{self._expected()}, and rounding hides {hidden:.1e} of the cost"
@@ -417,7 +417,11 @@ class Search:
             if left and step.decrease <= max(share, TRACE * dear):
                 return Status.INFEASIBLE
             stays = len(merits) > _PATIENCE and merits[-_PATIENCE - 1] - min(merits[-_PATIENCE:]) <= NOTABLE * dear
-            return Status.INFEASIBLE if stays else None
+            if not stays or step.elastic or self.tightening.needed:
+                return Status.INFEASIBLE if stays else None
+            # Rows that the model can meet are not known to be infeasible, unless margins move with the motion.
+            self.reason = f"{_PATIENCE} iterations have hardly lowered violations; {self._numbers(tolerance)}"
+            return Status.STALLED
         if step.decrease <= share:
             return Status.CONVERGED
         gained = sum(item.decrease for item in self.history[-_PATIENCE:])
@@ -513,7 +517,7 @@ class Search:
         integrator: Any = self.problem.integrator
         if getattr(integrator, "guard", None) is None:
             return self.problem.integrator
-        halvings = int(motion.statistics.substeps.max(initial=1)).bit_length() + _HALVINGS
+        halvings = int(motion.statistics.halvings.max(initial=0)) + _HALVINGS
         guard = replace(integrator.guard, max_halvings=min(integrator.guard.max_halvings, halvings))
         bounded: Integrator = replace(integrator, guard=guard)
         return bounded

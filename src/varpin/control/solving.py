@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,16 +21,19 @@ from varpin.control.problem import FASTEST, OptimalControlProblem, require_probl
 from varpin.control.refine import refine
 from varpin.control.rollout import around, controls_along, first_commands
 from varpin.control.search import Report, Search
-from varpin.control.sizes import FEASIBLE, NOTABLE, TRACE
+from varpin.control.sizes import FEASIBLE, NOTABLE, SLIGHT, TRACE
 from varpin.control.solution import Solution
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, VarpinError
 from varpin.finding import announce
 from varpin.linearization import node_jets
+from varpin.mechanics.forces import of_kind
 from varpin.model import degrees_hint
 from varpin.signals.commands import as_moved, with_ends
 from varpin.signals.policy import LinearPolicy
+from varpin.simulation.choice import STIFF
 from varpin.simulation.record import rollout
+from varpin.simulation.spectrum import masses
 from varpin.support.checks import JointValues, count, finite_array, flag, positive, real, told_motion
 from varpin.support.one_thread import one_thread
 from varpin.trajectory import Trajectory
@@ -37,6 +42,9 @@ Callback = Callable[[Iteration], None] | Callable[[Iteration, Trajectory], None]
 Progress = Callable[[int, int], None]
 # States at a problem's nodes: q (N + 1, n) [rad or m] and v (N + 1, n) [rad/s or m/s].
 _Path = tuple[Floats, Floats]
+
+# Factor between the widths of dry friction from one search to the next; from 2 to 5.
+_SHARPENED = 3.0
 
 logger = logging.getLogger(__name__)
 
@@ -78,9 +86,10 @@ def solve(
 
     Main args:
         problem: What to minimize.
-        controls: Initial controls: None to hold the robot at q0; an array (R, m) or (m,), R the number of
-            decisions; by joint name; a :class:`LinearPolicy`; or a :class:`Solution`, whose policy then runs on this
-            problem. Controls outside the problem's limits are clipped.
+        controls: Initial controls: None to hold the robot at q0 (or, where dry friction is too sharp for the step, to
+            follow plans under wider friction, each of at most ``max_iterations``); an array (R, m) or (m,), R the
+            number of decisions; by joint name; a :class:`LinearPolicy`; or a :class:`Solution`, whose policy then runs
+            on this problem. Controls outside the problem's limits are clipped.
         tolerance: Stop when the expected decrease is below this fraction of the cost at stake, (O9). For squared
             distances that is about their value; constants in the cost and the noise cost do not count.
         max_iterations: Greatest number of iterations.
@@ -152,12 +161,17 @@ def solve(
         tolerance: float = tolerance,
     ) -> Solution:
         search = Search(problem, second_order=second_order, regularization=regularization)
+        interrupted, last = False, most
         if resume is not None:
             search.resume(resume)
         elif path is not None:
             search.begin(_commands_along(problem, path, controls_along(problem, controls)))
-        else:
+        elif controls is not None:
             search.begin(first_commands(problem, controls))
+        else:
+            commands, interrupted = _led_to(problem, tolerance, most, deadline)
+            search.begin(commands)
+            last = 0 if interrupted else most
         known = len(search.history)
 
         def report(item: Iteration, motion: Trajectory) -> None:
@@ -167,7 +181,9 @@ def solve(
                 # A converged search reports once more after its last iteration.
                 progress(min(item.index + 1 - known, most), most)
 
-        plan = searched(search, tolerance, most, deadline, report)
+        plan = searched(search, tolerance, last, deadline, report)
+        if interrupted:
+            return replace(plan, status=Status.INTERRUPTED, reason="under dry friction that is wider than the scene's")
         if plan.status is Status.INFEASIBLE and not (controls is None and path is None):
             advice = "; the default start, without controls= and states=, may have a plan"
             return replace(plan, reason=plan.reason + advice)
@@ -194,6 +210,54 @@ def searched(search: Search, tolerance: float, most: int, deadline: float, repor
     except KeyboardInterrupt:
         status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
     return search.solution(status)
+
+
+def _led_to(problem: OptimalControlProblem, tolerance: float, most: int, deadline: float) -> tuple[Commands, bool]:
+    """The commands of the default first motion, and whether Ctrl-C has ended what leads to it.
+
+    Where dry friction turns within a small part of a step's change of the velocity, its slope at rest tells little of
+    it, and a search from rest goes astray. So the problem is first solved with friction wide enough for its step, and
+    each plan's states lead to the next one with sharper friction.
+    """
+    commands, interrupted = first_commands(problem, None), False
+    gentler = _gentler(problem)
+    for easier, harder in pairwise([*gentler, problem] if gentler else []):
+        try:
+            search = Search(easier)
+            search.begin(commands)
+            plan = searched(search, max(tolerance, SLIGHT), most, deadline, lambda *_: None)
+            commands = _commands_along(harder, (plan.trajectory.q, plan.trajectory.v), None)
+        except VarpinError as error:
+            logger.info("%s: under wider dry friction: %s", problem.scene.robot.name, error)
+            continue
+        if plan.status is Status.INTERRUPTED:
+            most, interrupted = 0, True
+    return commands, interrupted
+
+
+def _gentler(problem: OptimalControlProblem) -> list[OptimalControlProblem]:
+    """The problem with ever sharper dry friction, from widths that its steps resolve on."""
+    scene = problem.scene
+    rubbing = of_kind(scene.elements, "CoulombFriction")
+    if not rubbing:
+        return []
+    slopes = np.zeros(scene.robot.dof)
+    for own in rubbing:
+        _, width, breakaway, _ = own.values
+        slopes[own.coordinate] += breakaway / width
+    # The rate is in inverse proportion to the widths.
+    rate = float(np.linalg.eigvals(np.linalg.solve(masses(scene, problem.q0[None])[0], np.diag(slopes))).real.max())
+    count = math.ceil(math.log(max(problem.dt * rate / STIFF, 1.0), _SHARPENED))
+
+    def widened(factor: float) -> OptimalControlProblem:
+        elements = list(scene.elements)
+        for k, own in enumerate(elements):
+            if own in rubbing:
+                level, width, *stribeck = own.values
+                elements[k] = own._replace(values=(level, factor * width, *stribeck))
+        return problem.changed(scene=scene.changed(elements=tuple(elements)))
+
+    return [widened(_SHARPENED**k) for k in range(count, 0, -1)]
 
 
 def _require_resumable(problem: OptimalControlProblem, resume: Solution) -> None:

@@ -33,7 +33,7 @@ def _numbers(P: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A body's inertial numbers as a function of ten coordinates: P = L E E' L', with L L' that of its nominal ones.
+    """A body's inertial numbers as a function of ten coordinates, (I2): P = L E E' L', L L' that of its nominal ones.
 
     E is lower triangular, with exponentials on its diagonal and 1 where the coordinates are 0. A coordinate of 1 is a
     change by a factor of about e, whatever the size of the body.

@@ -44,11 +44,13 @@ _HORIZON = 1.0
 # Shortest stretches [s], with which the search begins, before each is twice as long: from a scene without friction or
 # payload, motions of a second are too far from the log to lead back.
 _FIRST = 0.2
-# Relative change of the cost at which a first search and the last one end.
-_LOOSE, _TIGHT = 1e-3, 1e-10
+# Expected decrease of the cost at which a first search ends, as a share of the cost, and the last one, as a share of
+# what one residual has in it: by a quarter of a deviation of a value. Where values are well told, the search is then
+# far closer, as it converges quadratically; inertias that logs hardly tell would go on for hundreds of evaluations.
+_LOOSE, _TIGHT = 1e-3, 0.05
 # Most corrections of a stretch's start for given parameters, and the share of its cost below which it is found: later
 # evaluations go on from it.
-_CORRECTIONS, _FOUND = 6, 1e-4
+_CORRECTIONS, _FOUND = 6, 1e-8
 # Samples from which a stretch's start is guessed, by a parabola.
 _GUESSED = 8
 # Longest delay of the controls that is looked for [s]: buses and drives have some milliseconds.
@@ -190,8 +192,8 @@ def identify(
             the search with the best values so far.
 
     Raises:
-        InputError: A name stands for no parameter, a log does not fit the scene, the scene has constraints, or a value
-            is out of its range.
+        InputError: A name stands for no parameter, a log does not fit the scene or has a dead encoder, the scene has
+            constraints, or a value is out of its range.
         UnknownJoint: A name is no joint of the robot.
     """
     refuse_constraints(require_scene(scene), "identify")
@@ -202,6 +204,8 @@ def identify(
         raise InputError("logs is empty: give one varpin.Log at least")
     chosen = given_integrator(integrator) or Gauss(2)
     matched, apart = (tuple(as_log(each).matched(scene) for each in some) for some in (given, others))
+    for doubt in (doubt for log in (*matched, *apart) for doubt in log.warnings if doubt.kind == "dead encoder"):
+        raise InputError(f"{doubt}; values from it would be wrong: give a log in which the joint moves, or lock it")
     step = float(np.median(np.diff(matched[0].t))) if dt is None else positive("dt", dt, "s")
     length = _HORIZON if horizon is None else real("horizon", horizon)
     late = None if delay is None else finite("delay", delay)
@@ -212,12 +216,11 @@ def identify(
     fit.best = y
     try:
         if scene.processes:
-            y, status = fit.search(partial(_predictions, fit, runs), y, _TIGHT, evaluation)
+            y, status = fit.search(partial(_predictions, fit, runs), y, evaluation, last=True)
         else:
             for finer in range(fit.doublings(runs), -1, -1):
                 stretches = [part for run in runs for part in run.stretches(2**finer)]
-                tolerance = _LOOSE if finer else _TIGHT
-                y, status = fit.search(partial(_simulations, fit, stretches), y, tolerance, evaluation)
+                y, status = fit.search(partial(_simulations, fit, stretches), y, evaluation, last=not finer)
     except KeyboardInterrupt:
         y, status = fit.best, "interrupted"
     return _made(fit, y, runs, [_Run(fit, log) for log in apart], status)
@@ -282,7 +285,7 @@ class _Fit:
         return self.varied if self.linear else replace(self.of, scene=scene, values=values).varied()
 
     def search(
-        self, evaluate: Callable[[Floats], tuple[Floats, Floats]], y: Floats, tolerance: float, evaluations: int
+        self, evaluate: Callable[[Floats], tuple[Floats, Floats]], y: Floats, evaluations: int, *, last: bool
     ) -> tuple[Floats, str]:
         """The y of least squares from ``y``, and how it ended."""
         P, prior = len(self.of.names), [c for columns, _ in self.bodies for c in columns]
@@ -311,11 +314,11 @@ class _Fit:
             system = np.concatenate([J, np.diag(weights)]), -np.concatenate([r, np.zeros(self.size)])
             step = lsq_linear(*system, (lower - y, upper - y + _OPEN), method="bvls").x
             gain = cost - float(np.square(r + J @ step).sum())
-            if gain <= tolerance * cost:
+            if gain <= (_TIGHT / len(r) if last else _LOOSE) * cost:
                 return y, "converged"
             trial = at(np.clip(y + step, lower, upper))
             if trial[2] < cost:
-                y, (r, J, cost), damping = self.best, trial, max(0.1 * damping, _LEAST_DAMPING)
+                y, (r, J, cost), damping = self.best, trial, max(0.3 * damping, _LEAST_DAMPING)
             elif damping > _MOST_DAMPING:
                 return y, "converged"
             else:
@@ -358,6 +361,14 @@ class _Run:
         u = self.log.u[at]
         passed = self.integral[at] + (edges - self.log.t[at])[:, None] * u
         return np.diff(passed, axis=0) / self.fit.dt, -np.diff(u, axis=0) / self.fit.dt
+
+    def settled(self, scene: Scene, late: float) -> list[_Stretch]:
+        """The stretches after a search for their starts, by shorter ones as :func:`identify` itself."""
+        for finer in range(self.fit.doublings([self]), -1, -1):
+            stretches = self.stretches(2**finer)
+            for each in stretches:
+                each.fitted(scene, (), late)
+        return stretches
 
     def stretches(self, finer: int = 1) -> list[_Stretch]:
         """The log in stretches of about the horizon, or this much shorter."""
@@ -438,7 +449,7 @@ class _Stretch:
         integrator, n = self.run.fit.integrator, scene.robot.dof
         try:
             linear = linearize_steps(scene, motion, integrator, motion.q[0])
-            D = integrator.in_parameters(scene, motion, varied)
+            D = integrator.in_parameters(scene, motion, varied) if varied else np.zeros((motion.steps, 2 * n, 0))
         except LinearizationError:
             return None
         by = motion_map(scene, motion, varied, (linear.A, linear.B, D), variational=integrator.variational)
@@ -454,7 +465,7 @@ class _Stretch:
     def fitted(self, scene: Scene, varied: Sequence[Varied], late: float) -> tuple[Floats, Floats]:
         """Residuals (r,) at the best start, and derivatives in parameters and delay (r, P + 1) as the start follows."""
         x0 = self.run.starts[self.begin]
-        found = self.residuals(scene, varied, late, x0)
+        found = self.residuals(scene, (), late, x0)
         for _ in range(_CORRECTIONS):
             if found is None:
                 break
@@ -463,10 +474,11 @@ class _Stretch:
             gain = 2.0 * float(step @ (Jx.T @ r)) - float(np.square(Jx @ step).sum())
             if gain <= _FOUND * float(r @ r):
                 break
-            trial = self.residuals(scene, varied, late, x0 - step)
+            trial = self.residuals(scene, (), late, x0 - step)
             if trial is None or not trial[0] @ trial[0] < r @ r:
                 break
             x0, found = x0 - step, trial
+        found = self.residuals(scene, varied, late, x0)
         if found is None:
             return np.full(self.measured.size, _LOST), np.zeros((self.measured.size, len(varied) + 1))
         r, Jx, J = found
@@ -565,9 +577,7 @@ def _made(fit: _Fit, y: Floats, runs: Sequence[_Run], apart: Sequence[_Run], sta
     covariance, null = _covariance(fit, slopes, prior)
     predicted, before = [], []
     for run in [*runs, *apart]:
-        stretches, varied = run.stretches(), fit.changed(scene, values)
-        for each in stretches:
-            each.fitted(scene, varied, late)
+        stretches = run.settled(scene, late)
         predicted.append(_positions(run, stretches, scene, late))
         before.append(_positions(run, stretches, fit.of.scene, 0.0 if fit.delay is None else fit.delay))
     residuals = tuple(run.log.q - own for run, own in zip([*runs, *apart], predicted, strict=True))
@@ -648,9 +658,9 @@ def _step_error(fit: _Fit, runs: Sequence[_Run], y: Floats) -> Floats:
     finer = copy(fit)
     finer.dt *= 0.5
     prior, steps = [c for columns, _ in fit.bodies for c in columns], []
+    scene = fit.of.scene_with(fit.values(y)[0])
     for each, of in ((fit, runs), (finer, [_Run(finer, run.log) for run in runs])):
-        each.least = np.inf
-        r, J = _simulations(each, [part for run in of for part in run.stretches()], y)
+        r, J = _simulations(each, [part for run in of for part in run.settled(scene, fit.late(y))], y)
         system = np.concatenate([J, np.eye(fit.size)[prior]]), np.concatenate([r, y[prior]])
         steps.append(np.linalg.lstsq(*system, rcond=_NOTHING)[0])
     change: Floats = fit.values(y)[1] @ (steps[0] - steps[1])

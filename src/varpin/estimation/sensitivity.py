@@ -134,8 +134,8 @@ def sensitivities(
 ) -> Sensitivities:
     """Exact derivatives of a motion in parameters of its scene.
 
-    They are those of the discrete map, step by step beside the linearization: x_theta' = A x_theta + dx'/dtheta, where
-    dx'/dtheta solves the factored step equation of A and B.
+    They are those of the discrete map, (L5), step by step beside the linearization: x_theta' = A x_theta + dx'/dtheta,
+    where dx'/dtheta solves the factored step equation of A and B.
 
     Main args:
         scene: The scene of the motion; constraints and kinematic inputs are no obstacle.
@@ -176,7 +176,9 @@ def motion_map(
     """The map of a motion whose steps have the derivatives A, B and D."""
     q, v = (np.ascontiguousarray(x) for x in (motion.q, motion.v))
     M, Lvq = node_jets(scene, q, v)
-    pull = np.stack([momentum_change(each, q, v) for each in varied], axis=2)
+    pull = np.zeros((*q.shape, len(varied)))
+    for k, each in enumerate(varied):
+        pull[:, :, k] = momentum_change(each, q, v)
     n, none = scene.robot.dof, np.zeros((scene.robot.dof, len(varied)))
     one, zero = np.eye(n), np.zeros((n, n))
     if variational:

@@ -1,4 +1,4 @@
-// Derivatives of a step in parameters of the mechanism. docs/identification.md, "Sensitivities". The parameters change
+// Derivatives of a step in parameters of the mechanism. docs/mathematics.md, "Sensitivities". The parameters change
 // L_q, L_v and F at the stages of a step, (Q_j, V_j) fixed, and so its equation and its end:
 //
 //     N dV = h sum_j (abar_ij dL_q + f_ij dF)_j - dL_v,i        dp1 = h sum_j b_j (dL_q + dF)_j + what dV gives
@@ -34,7 +34,8 @@ class ParameterColumns {
     const std::vector<Parameter> parameters;
     int count() const { return static_cast<int>(parameters.size()); }
 
-    // The right side (s, n) of the step equation at its root, and the direct part (n) of the end's momentum.
+    // Equation (L5): the right side (s, n) of the step equation at its root, and the direct part (n) of the end's
+    // momentum.
     void right_side(int which, double h, const double* force, int stride, std::vector<double>& right,
                     std::vector<double>& end) {
         const int n = equation_.n, stages = equation_.stages;
