@@ -209,12 +209,12 @@ def _doubts(scene: Scene, t: Floats, q: Floats, u: Floats) -> Iterator[Finding]:
         yield Finding("log in degrees", sentence)
     elif beyond[far] > _BEYOND:
         unit = joint_unit(scene.robot, far)
-        text = f"q of {names[far]!r} is up to {beyond[far]:.3g} {unit} beyond its limits: are columns in another order?"
+        text = f"q of {names[far]!r} is {beyond[far]:.3g} {unit} beyond its limits: columns may be in another order"
         yield Finding("log beyond limits", text, names[far], value=float(beyond[far]), unit=unit)
     still, driven = most == least, (scene.actuation != 0.0) @ (np.ptp(u, axis=0) > 0.0)
     # An encoder that reads one number to the last bit while a control that changes acts on its joint.
     for joint in np.flatnonzero(still & driven & (not still.all())):
-        text = f"q of {names[joint]!r} is one number throughout: is its encoder dead? NaN stands for missing samples"
+        text = f"q of {names[joint]!r} is one number throughout: its encoder may be dead, and missing samples are NaN"
         yield Finding("dead encoder", text, names[joint])
     if steps[at] > _GAP * usual:
         text = f"the log has no samples for {steps[at]:.4g} s after t = {t[at]:.6g} s, its usual step is {usual:.3g} s"
