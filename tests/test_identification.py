@@ -212,3 +212,61 @@ def test_what_is_refused_and_interrupted(caplog):
     assert found.status == "interrupted"
     assert seen[-1] < seen[0]
     assert found.values[-1] > 0.5
+
+
+def chain_log(scene, period=1e-2, samples=100, noise=1e-4, seed=0):
+    """A chain under waves of torque, by steps of a tenth of the period."""
+    n, rng = scene.robot.dof, np.random.default_rng(seed)
+    t = period * np.arange(samples)
+    u = 2.0 * np.sin(2.0 * np.pi * np.outer(t, [0.8, 1.7][:n]))
+    made = vp.simulate(scene, [0.5, -0.4], np.zeros(n), dt=0.1 * period, steps=10 * (samples - 1), check=False,
+                       controls=np.repeat(u[:-1], 10, axis=0), integrator=vp.Gauss(3))  # fmt: skip
+    return vp.Log(t, made.q[::10] + noise * rng.standard_normal((samples, n)), u)
+
+
+CHAIN = vp.planar_chain(2)
+
+
+def test_dry_friction_leads_no_start_astray():
+    truth, begin = (vp.Scene(CHAIN, damping=d, friction=f) for d, f in (([0.5, 0.3], [0.3, 0.2]), (0.1, 0.1)))
+    found = vp.identify(
+        begin, chain_log(truth, 2e-3, 500), ["damping", "friction"], q_noise=1e-4, delay=0.0, horizon=0.2
+    )
+    assert not found.warnings
+    assert within(found, [0.5, 0.3, 0.3, 0.2])
+
+
+@pytest.mark.parametrize("begin", [(20.0, -1.0), (5.0, 0.0)])
+def test_springs_and_their_rests_are_told_together(begin):
+    truth = vp.Scene(CHAIN, damping=0.3, forces=vp.JointSpring(8.0, 0.5))
+    scene = vp.Scene(CHAIN, damping=0.3, forces=vp.JointSpring(*begin))
+    found = vp.identify(scene, chain_log(truth), ["stiffness", "rest"], q_noise=1e-4, delay=0.0)
+    again = vp.identify(truth, chain_log(truth), ["stiffness", "rest"], q_noise=1e-4, delay=0.0)
+    assert within(found, [8.0, 8.0, 0.5, 0.5])
+    assert found.deviations == pytest.approx(again.deviations, rel=0.02)
+
+
+def test_gains_of_servos_are_found_from_others():
+    truth, begin = (
+        vp.Scene(CHAIN, forces=vp.PositionServo(*gains)) for gains in (([60.0, 30.0], [4.0, 2.0]), (100.0, 0.0))
+    )
+    shown = chain_log(truth)
+    found = vp.identify(begin, shown, ["servo_stiffness", "servo_damping"], q_noise=1e-4, delay=0.0)
+    assert within(found, [60.0, 30.0, 4.0, 2.0])
+
+
+def test_logs_of_other_rates_and_with_gaps():
+    truth, begin = vp.Scene(CHAIN, damping=[0.5, 0.3]), vp.Scene(CHAIN, damping=0.1)
+    fine, coarse = chain_log(truth, 1e-3, 600), chain_log(truth, 1e-2, 100, seed=1)
+    for logs in ([fine, coarse], [coarse, fine]):
+        assert within(vp.identify(begin, logs, "damping", q_noise=1e-4, delay=0.0), [0.5, 0.3])
+    whole = chain_log(truth, 1e-2, 300)
+    kept = np.r_[0:120, 210:300]
+    gap = vp.Log(1.7e9 + whole.t[kept], whole.q[kept], whole.u[kept])
+    assert within(vp.identify(begin, gap, "damping", q_noise=1e-4, delay=0.0), [0.5, 0.3])
+
+
+def test_less_than_the_scene_carries():
+    scene = vp.Scene(vp.load_robot("ur5", payload=vp.Payload("tool0", 2.5)), damping=DAMPING)
+    found = vp.identify(scene, log(), "payload", q_noise=NOISE, delay=0.0)
+    assert found.values == pytest.approx([-0.5], abs=1e-2)

@@ -19,10 +19,10 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from varpin.arrays import Floats
-from varpin.errors import InputError, LinearizationError, SingularMassMatrix
+from varpin.errors import InputError, LinearizationError, RobotError, SingularMassMatrix
 from varpin.estimation.consistency import Body
 from varpin.estimation.filter import kalman_filter, variances
-from varpin.estimation.log import Log, as_log
+from varpin.estimation.log import GAP, Log, as_log
 from varpin.estimation.parameters import INERTIAL, Parameters, parameters_of
 from varpin.estimation.sensitivity import motion_map
 from varpin.finding import Finding, announce
@@ -51,6 +51,8 @@ _LOOSE, _TIGHT = 1e-3, 0.05
 # Most corrections of a stretch's start for given parameters, and the share of its cost below which it is found: later
 # evaluations go on from it.
 _CORRECTIONS, _FOUND = 6, 1e-8
+# Most trials of a correction, each a quarter as long: where dry friction turns, whole ones lead astray.
+_SHORTENED = 12
 # Samples from which a stretch's start is guessed, by a parabola.
 _GUESSED = 8
 # Longest delay of the controls that is looked for [s]: buses and drives have some milliseconds.
@@ -59,11 +61,9 @@ _LATEST = 0.1
 _NOTHING = 1e-7
 # Coefficients of a combination below this share of its largest are rounding.
 _NAMED = 1e-3
-# Damping of a step in units of the squared column sizes: where steps are right it vanishes, after a step that was not
-# it begins here, and where no step helps any more it ends.
-_LEAST_DAMPING, _FIRST_DAMPING, _MOST_DAMPING = 1e-12, 1e-3, 1e6
-# The bounds of a step must differ [in the parameters' units].
-_OPEN = 1e-300
+# Damping of a step in units of the squared column sizes: at first and after a step that was not right, where steps are,
+# and where no step helps any more.
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-12, 1e6
 # Standard deviations of a delay, and residuals in units of the encoders' noise, that are told.
 _SURE, _MISFIT = 4.0, 2.0
 # Residual in units of the noise that stands for a motion that cannot be simulated.
@@ -198,15 +198,16 @@ def identify(
     """
     refuse_constraints(require_scene(scene), "identify")
     of = parameters_of(scene, parameters)
-    given = (logs,) if isinstance(logs, Log | Trajectory) else tuple(logs)
-    others = (held_out,) if isinstance(held_out, Log | Trajectory) else tuple(held_out)
+    given, others = _several("logs", logs), _several("held_out", held_out)
     if not given:
         raise InputError("logs is empty: give one varpin.Log at least")
     chosen = given_integrator(integrator) or Gauss(2)
     matched, apart = (tuple(as_log(each).matched(scene) for each in some) for some in (given, others))
+    if v_noise is not None and any(log.v is None for log in (*matched, *apart)):
+        raise InputError("v_noise is given, and a log has no velocities v")
     for doubt in (doubt for log in (*matched, *apart) for doubt in log.warnings if doubt.kind == "dead encoder"):
         raise InputError(f"{doubt}; values from it would be wrong: give a log in which the joint moves, or lock it")
-    step = float(np.median(np.diff(matched[0].t))) if dt is None else positive("dt", dt, "s")
+    step = min(float(np.median(np.diff(log.t))) for log in matched) if dt is None else positive("dt", dt, "s")
     length = _HORIZON if horizon is None else real("horizon", horizon)
     late = None if delay is None else finite("delay", delay)
     fit = _Fit(of, chosen, step, length, q_noise, v_noise, late, callback)
@@ -224,6 +225,15 @@ def identify(
     except KeyboardInterrupt:
         y, status = fit.best, "interrupted"
     return _made(fit, y, runs, [_Run(fit, log) for log in apart], status)
+
+
+def _several(name: str, logs: Any) -> tuple[Any, ...]:
+    """One log or several as several."""
+    if isinstance(logs, Log | Trajectory):
+        return (logs,)
+    if not isinstance(logs, Sequence):
+        raise InputError(f"{name} must be a varpin.Log or several, got {type(logs).__name__}")
+    return tuple(logs)
 
 
 class _Fit:
@@ -248,10 +258,11 @@ class _Fit:
         self.deviation = np.sqrt(variances("q_noise", q_noise, names))
         self.v_deviation = None if v_noise is None else np.sqrt(variances("v_noise", v_noise, names))
         self.bodies = _bodies(of)
+        self.prior = [c for columns, _ in self.bodies for c in columns]
         self.size = len(of.names) + (delay is None)
-        # The derivatives of L and F in a parameter are the same for all its values, but in gains of limited servos.
+        # L and F are linear in all parameters together, but for gains of servos and for springs with their rests.
         self.varied = of.varied()
-        self.linear = not any(name.startswith("servo") for name in of.names)
+        self.linear = not any(name.startswith(("servo", "rest", "stiffness")) for name in of.names)
         self.best, self.least, self.done = np.zeros(self.size), np.inf, 0
         self.jacobian = np.zeros((1, self.size))
 
@@ -288,13 +299,18 @@ class _Fit:
         self, evaluate: Callable[[Floats], tuple[Floats, Floats]], y: Floats, evaluations: int, *, last: bool
     ) -> tuple[Floats, str]:
         """The y of least squares from ``y``, and how it ended."""
-        P, prior = len(self.of.names), [c for columns, _ in self.bodies for c in columns]
+        P, prior = len(self.of.names), self.prior
         lower, upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
         lower[:P] = np.where(np.isin(np.arange(P), prior), -np.inf, self.of.least)
         lower[P:], upper[P:] = -_LATEST, _LATEST
 
         def at(y: Floats) -> tuple[Floats, Floats, float]:
-            r, J = evaluate(y)
+            try:
+                with np.errstate(over="ignore", invalid="ignore"):
+                    r, J = evaluate(y)
+            except RobotError:
+                # A step too far: inertias that are not finite.
+                r, J = np.full(len(self.jacobian), _LOST), np.zeros_like(self.jacobian)
             self.done += 1
             both = np.concatenate([r, y[prior]])
             cost = float(both @ both)
@@ -304,7 +320,7 @@ class _Fit:
                 self.callback(self.done, float(np.sqrt(r @ r / len(r))))
             return both, np.concatenate([J, np.eye(self.size)[prior]]), cost
 
-        self.least, damping = np.inf, _LEAST_DAMPING
+        self.least, damping = np.inf, _FIRST_DAMPING
         r, J, cost = at(np.clip(y, lower, upper))
         y = self.best
         for _ in range(evaluations):
@@ -312,7 +328,7 @@ class _Fit:
             sizes = np.linalg.norm(J, axis=0)
             weights = np.sqrt(damping) * np.where(sizes > 0.0, sizes, 1.0)
             system = np.concatenate([J, np.diag(weights)]), -np.concatenate([r, np.zeros(self.size)])
-            step = lsq_linear(*system, (lower - y, upper - y + _OPEN), method="bvls").x
+            step = lsq_linear(*system, (lower - y, upper - y), method="bvls").x
             gain = cost - float(np.square(r + J @ step).sum())
             if gain <= (_TIGHT / len(r) if last else _LOOSE) * cost:
                 return y, "converged"
@@ -342,11 +358,12 @@ class _Run:
     def __init__(self, fit: _Fit, log: Log) -> None:
         self.fit, self.log, h = fit, log, fit.dt
         self.starts: dict[int, Floats] = {}
+        self.known: tuple[float, tuple[Floats, Floats]] = (np.nan, (np.zeros(0), np.zeros(0)))
         after = (log.t - log.t[0]) / h
         self.duration = float(log.t[-1] - log.t[0])
         self.steps = max(1, int(np.ceil(after[-1] - 1e-6)))
         # A sample next to a node is at it, though clocks round.
-        near = np.abs(after - np.rint(after)) < 1e-6
+        near = np.abs(after - np.rint(after)) < max(1e-6, 4.0 * np.spacing(np.abs(log.t[-1])) / h)
         after = np.where(near, np.rint(after), after)
         self.node = np.minimum(after.astype(int), self.steps - 1)
         self.share = after - self.node
@@ -356,11 +373,14 @@ class _Run:
 
     def controls(self, delay: float) -> tuple[Floats, Floats]:
         """The mean controls of the steps (N, m), and their derivatives in the delay."""
+        if self.known[0] == delay:
+            return self.known[1]
         edges = self.log.t[0] + self.fit.dt * np.arange(self.steps + 1) - delay
         at = np.clip(np.searchsorted(self.log.t, edges + 1e-9, side="right") - 1, 0, len(self.log.t) - 1)
         u = self.log.u[at]
         passed = self.integral[at] + (edges - self.log.t[at])[:, None] * u
-        return np.diff(passed, axis=0) / self.fit.dt, -np.diff(u, axis=0) / self.fit.dt
+        self.known = delay, (np.diff(passed, axis=0) / self.fit.dt, -np.diff(u, axis=0) / self.fit.dt)
+        return self.known[1]
 
     def settled(self, scene: Scene, late: float) -> list[_Stretch]:
         """The stretches after a search for their starts, by shorter ones as :func:`identify` itself."""
@@ -373,7 +393,10 @@ class _Run:
     def stretches(self, finer: int = 1) -> list[_Stretch]:
         """The log in stretches of about the horizon, or this much shorter."""
         parts = finer * max(1, round(self.duration / self.fit.horizon))
-        ends = np.unique(self.steps * np.arange(parts + 1) // parts)
+        # What acts in a gap is not in the log.
+        gaps = np.flatnonzero(np.diff(self.log.t) > GAP * np.median(np.diff(self.log.t)))
+        cuts = np.concatenate([self.node[gaps] + 1, self.node[gaps + 1]])
+        ends = np.unique(np.concatenate([self.steps * np.arange(parts + 1) // parts, cuts]))
         found = [_Stretch(self, a, b) for a, b in pairwise(ends.tolist())]
         return [each for each in found if each.samples.any()]
 
@@ -385,7 +408,8 @@ class _Stretch:
         self.run, self.begin, self.end = run, begin, end
         last = end == run.steps
         self.samples = (run.node >= begin) & ((run.node < end) | last)
-        run.starts.setdefault(begin, self._guess())
+        if begin not in run.starts:
+            run.starts[begin] = self._guess()
 
     def _guess(self) -> Floats:
         """Positions and velocities at the first node by parabolas through the samples next to it."""
@@ -474,9 +498,14 @@ class _Stretch:
             gain = 2.0 * float(step @ (Jx.T @ r)) - float(np.square(Jx @ step).sum())
             if gain <= _FOUND * float(r @ r):
                 break
-            trial = self.residuals(scene, (), late, x0 - step)
-            if trial is None or not trial[0] @ trial[0] < r @ r:
+            for _ in range(_SHORTENED):
+                trial = self.residuals(scene, (), late, x0 - step)
+                if trial is not None and trial[0] @ trial[0] < r @ r:
+                    break
+                step = 0.25 * step
+            else:
                 break
+            assert trial is not None
             x0, found = x0 - step, trial
         found = self.residuals(scene, varied, late, x0)
         if found is None:
@@ -573,8 +602,7 @@ def _through(scene: Scene, fit: _Fit, state: Floats, q: Floats, v: Floats, u: Fl
 def _made(fit: _Fit, y: Floats, runs: Sequence[_Run], apart: Sequence[_Run], status: str) -> Identification:
     values, slopes = fit.values(y)
     scene, late, P = fit.of.scene_with(values), fit.late(y), len(fit.of.names)
-    prior = [c for columns, _ in fit.bodies for c in columns]
-    covariance, null = _covariance(fit, slopes, prior)
+    covariance, null = _covariance(fit, slopes, fit.prior)
     predicted, before = [], []
     for run in [*runs, *apart]:
         stretches = run.settled(scene, late)
@@ -612,14 +640,14 @@ def _covariance(fit: _Fit, slopes: Floats, prior: Sequence[int]) -> tuple[Floats
     sizes = np.linalg.norm(J, axis=0)
     scale = np.where(sizes > _NOTHING * sizes.max(initial=1.0), sizes, 1.0)
     _, spread, rows = np.linalg.svd(J / scale, full_matrices=False)
-    known = spread > _NOTHING * spread[0]
+    known = spread > _NOTHING * max(spread[0], 1.0)
     names = [*fit.of.names, *(["delay"] if fit.delay is None else [])]
     # Of bodies the null space is that of their numbers.
     to = slopes.copy() if fit.delay is not None else np.vstack([slopes, np.eye(1, fit.size, fit.size - 1)])
     null = (rows[~known] / scale) @ to.T
     joined = np.concatenate([J, np.eye(fit.size)[list(prior)]]) / scale
     _, spread, rows = np.linalg.svd(joined, full_matrices=False)
-    known = spread > _NOTHING * spread[0]
+    known = spread > _NOTHING * max(spread[0], 1.0)
     root = (rows[known] / spread[known, None]) / scale
     covariance = to @ (root.T @ root) @ to.T
     lost = np.abs((rows[~known] / scale) @ to.T).max(axis=0, initial=0.0) > _NAMED / scale.max()
@@ -657,7 +685,7 @@ def _step_error(fit: _Fit, runs: Sequence[_Run], y: Floats) -> Floats:
     """What half the step changes in the values (P,), to first order."""
     finer = copy(fit)
     finer.dt *= 0.5
-    prior, steps = [c for columns, _ in fit.bodies for c in columns], []
+    prior, steps = fit.prior, []
     scene = fit.of.scene_with(fit.values(y)[0])
     for each, of in ((fit, runs), (finer, [_Run(finer, run.log) for run in runs])):
         r, J = _simulations(each, [part for run in of for part in run.settled(scene, fit.late(y))], y)
@@ -669,20 +697,27 @@ def _step_error(fit: _Fit, runs: Sequence[_Run], y: Floats) -> Floats:
 
 def _doubts(fit: _Fit, made: Identification, changes: Floats) -> list[Finding]:
     found = []
+    if fit.least >= _LOST**2:
+        text = (
+            "motions with these values cannot be simulated from all starts: take a smaller dt, or other values to begin"
+        )
+        found.append(Finding("lost", text))
     by_noise = np.divide(np.abs(changes), made.deviations, out=np.zeros_like(changes), where=made.deviations > 0.0)
     k = int(np.argmax(by_noise))
     if not by_noise[k] <= 1.0:
+        higher = "" if fit.integrator.order > 2 else " or a method of higher order, such as varpin.Gauss(2)"
         text = (
             f"half the step changes {made.names[k]} by {changes[k]:.3g} {made.units[k]}, {by_noise[k]:.3g} standard "
-            "deviations: take a smaller dt or a method of higher order, such as varpin.Gauss(2)"
+            f"deviations: take a smaller dt{higher}"
         )
         found.append(Finding("step", text, value=float(changes[k]), unit=made.units[k]))
     if made.status == "evaluations":
         found.append(Finding("evaluations", "the search ended at its most evaluations: evaluations= allows more"))
     squares = [np.square(own / fit.deviation) for own in made.residuals]
-    with np.errstate(all="ignore"):
-        by_joint = np.sqrt(np.nanmean(np.concatenate(squares), axis=0))
-    worst = int(np.nanargmax(by_joint)) if np.isfinite(by_joint).any() else 0
+    together = np.concatenate(squares)
+    there = np.isfinite(together)
+    by_joint = np.sqrt(np.where(there, together, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1))
+    worst = int(np.argmax(by_joint))
     over = np.sqrt(fit.least / len(fit.jacobian))
     if fit.of.scene.processes and not over <= _MISFIT:
         text = f"the innovations are {over:.3g} times what the scene's noise and q_noise explain: something else acts"
@@ -696,5 +731,9 @@ def _doubts(fit: _Fit, made: Identification, changes: Floats) -> list[Finding]:
         found.append(Finding("misfit", text, joint, value=float(by_joint[worst])))
     if fit.delay is None and abs(made.delay) > max(_SURE * made.delay_deviation, 1e-2 * fit.dt):
         text = f"the controls act {1e3 * made.delay:.3g} ms later than the logs say, which the values allow for"
+        if abs(made.delay) >= _LATEST:
+            text = (
+                f"the delay of the controls is {_LATEST:g} s or more, beyond what is looked for: give delay= or shift t"
+            )
         found.append(Finding("delay", text, value=made.delay, unit="s"))
     return found

@@ -25,7 +25,7 @@ from varpin.trajectory import Trajectory
 FORMAT = "varpin.log/1"
 
 # A gap in the clock of so many median steps is told: some lost packets of a bus are fewer.
-_GAP = 10.0
+GAP = 10.0
 # Longest median step [s] that is not told: arms are logged at 10 Hz and more, so longer ones look like milliseconds.
 _SLOW = 0.5
 # Distance beyond a joint's limits that is told [rad or m]: stops yield, and zeros of encoders are off, by less.
@@ -216,7 +216,7 @@ def _doubts(scene: Scene, t: Floats, q: Floats, u: Floats) -> Iterator[Finding]:
     for joint in np.flatnonzero(still & driven & (not still.all())):
         text = f"q of {names[joint]!r} is one number throughout: its encoder may be dead, and missing samples are NaN"
         yield Finding("dead encoder", text, names[joint])
-    if steps[at] > _GAP * usual:
+    if steps[at] > GAP * usual:
         text = f"the log has no samples for {steps[at]:.4g} s after t = {t[at]:.6g} s, its usual step is {usual:.3g} s"
         yield Finding("gap in the log", text, time=float(t[at]), value=float(steps[at]), unit="s")
 

@@ -34,6 +34,10 @@ _UNITS = ("kg", "kg m", "kg m", "kg m", *["kg m^2"] * 6)
 _APART, _GAIN_SHARE = 1.0, 1e-5
 
 
+# Least stiffness of a servo [N m/rad]: without any it would be none, and its control nothing.
+_SOFTEST = 1e-6
+
+
 class _Kind(NamedTuple):
     """A number of a force on a joint."""
 
@@ -50,7 +54,7 @@ _KINDS = {
     "stiffness": _Kind(JointSpring, "stiffness", "N m/rad"),
     "rest": _Kind(JointSpring, "rest", "rad", False, -np.inf),
     "armature": _Kind(Armature, "inertia", "kg m^2"),
-    "servo_stiffness": _Kind(PositionServo, "stiffness", "N m/rad", False),
+    "servo_stiffness": _Kind(PositionServo, "stiffness", "N m/rad", False, _SOFTEST),
     "servo_damping": _Kind(PositionServo, "damping", "N m s/rad", False),
 }
 
@@ -95,8 +99,10 @@ class Parameters:
         found = []
         for k, name in enumerate(self.names):
             apart = np.zeros_like(self.values)
-            apart[k] = _GAIN_SHARE * abs(self.values[k]) if name.startswith("servo") else _APART
-            low = bool(self.values[k] - apart[k] < self.least[k])
+            gain = name.startswith("servo")
+            apart[k] = _GAIN_SHARE * max(abs(self.values[k]), _APART) if gain else _APART
+            # L and F are linear, so one side is as good, and never passes a body without mass.
+            low = bool(self.values[k] - apart[k] < self.least[k]) if gain else bool(np.isfinite(self.least[k]))
             below = self.scene if low else self.scene_with(self.values - apart)
             found.append(Varied(self.scene_with(self.values + apart), below, (1.0 if low else 2.0) * apart[k]))
         return tuple(found)
@@ -135,8 +141,9 @@ def _rows(scene: Scene, given: str) -> list[tuple[str, float, float, str]]:
         return _joint_rows(scene, kind, place)
     if kind == "payload":
         frame = place or scene.robot.end_effector
-        _per_unit(scene.robot, kind, frame)
-        return [(f"payload:{frame}", 0.0, 0.0, "kg")]
+        # Less than nothing is what the robot carries in the scene, and not in the log.
+        joint, _ = _per_unit(scene.robot, kind, frame)
+        return [(f"payload:{frame}", 0.0, -float(scene.robot.model.inertias[joint].mass), "kg")]
     if kind != "inertia":
         raise InputError(
             f"there is no parameter {given!r}: kinds are {', '.join([*_KINDS, 'payload', 'inertia'])}, alone or as "
@@ -146,6 +153,10 @@ def _rows(scene: Scene, given: str) -> list[tuple[str, float, float, str]]:
     for one in [place] if place else [each.link for each in inertials_of(scene.robot.model)]:
         link, _, number = one.partition(":")
         own = inertial_numbers(scene.robot, link)[1]
+        if not own[0] > 0.0 and place:
+            raise InputError(f"{given}: link {link!r} has no mass, and its inertia cannot be found from none")
+        if not own[0] > 0.0:
+            continue
         for name, value, unit in zip(INERTIAL, own.tolist(), _UNITS, strict=True):
             if number in ("", name):
                 found.append((f"inertia:{link}:{name}", value, 0.0 if name == "m" else -np.inf, unit))

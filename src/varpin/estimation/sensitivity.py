@@ -48,8 +48,6 @@ class Sensitivities:
         q: Derivatives of the configurations (N + 1, n, P).
         v: Of the velocities (N + 1, n, P).
         p: Of the momenta (N + 1, n, P).
-        q0: Derivatives of the state (q, v) at the nodes in the first configuration (N + 1, 2n, n), with v0 fixed.
-        v0: The same in the first velocity (N + 1, 2n, n).
     """
 
     names: tuple[str, ...]
@@ -153,7 +151,9 @@ def sensitivities(
     """
     if motion.noisy:
         raise InputError("sensitivities are of a motion without noise, and this one has it: simulate it without rng=")
-    of = parameters_of(require_scene(scene), parameters)
+    if require_scene(scene).noise.velocity_dependent:
+        raise InputError("sensitivities do not take noise whose fields depend on the velocity, as its drift has M^-1")
+    of = parameters_of(scene, parameters)
     linear = linearize(scene, motion, integrator=integrator)
     chosen = matching_integrator(scene, motion, integrator)
     varied = of.varied()
