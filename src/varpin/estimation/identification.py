@@ -192,8 +192,8 @@ def identify(
             the search with the best values so far.
 
     Raises:
-        InputError: A name stands for no parameter, a log does not fit the scene, the scene has constraints, or a value
-            is out of its range.
+        InputError: A name stands for no parameter, a log does not fit the scene or has a dead encoder, the scene has
+            constraints, or a value is out of its range.
         UnknownJoint: A name is no joint of the robot.
     """
     refuse_constraints(require_scene(scene), "identify")
@@ -204,6 +204,8 @@ def identify(
         raise InputError("logs is empty: give one varpin.Log at least")
     chosen = given_integrator(integrator) or Gauss(2)
     matched, apart = (tuple(as_log(each).matched(scene) for each in some) for some in (given, others))
+    for doubt in (doubt for log in (*matched, *apart) for doubt in log.warnings if doubt.kind == "dead encoder"):
+        raise InputError(f"{doubt}; values from it would be wrong: give a log in which the joint moves, or lock it")
     step = float(np.median(np.diff(matched[0].t))) if dt is None else positive("dt", dt, "s")
     length = _HORIZON if horizon is None else real("horizon", horizon)
     late = None if delay is None else finite("delay", delay)
