@@ -309,7 +309,11 @@ def test_a_log_in_files(tmp_path):
     np.savez(tmp_path / "plain.npz", **{name: value.astype(np.float32) for name, value in good().items()})
     assert vp.Log.load(tmp_path / "plain.npz").joints is None
     np.savez(tmp_path / "short.npz", t=[0.0, 1.0])
-    for text, why in (("t,q_a,u_a\n0,1,two\n", "two"), ("t,q_a\n0,1\n", "u_<joint>"), ("t,q_a,u_a\n0,1\n", "3 names")):
+    for text, why in (
+        ("t,q_a,u_a\n0,1,two\n", "two"),
+        ("t,q_a\n0,1\n", "u_<joint>"),
+        ("t,q_a,u_a\n0,1\n", "2 col"),
+    ):
         path.write_text(text, encoding="utf-8")
         with pytest.raises(vp.FileError, match=why):
             vp.Log.load(path)
@@ -348,7 +352,7 @@ BAD = {
     "fewer than 2 samples of joint 'joint2'": good(q=np.array([[1.0, np.nan]] * 20)),
     "'elbow'": good(joints=("joint1", "elbow")),
     "different names": good(joints=("joint1", "joint1")),
-    "no column of q of joint 'joint2'": {**good(), "q": good()["q"][:, :1], "joints": ("joint1",)},
+    "1 columns of q, the scene 2, of joint1, joint2": {**good(), "q": good()["q"][:, :1], "joints": ("joint1",)},
     "columns of u": good(u=np.ones((20, 3))),
     "a row for each of the 20 times": good(u=np.ones((19, 2))),
     "must have the shape of q": good(v=np.ones((20, 1))),

@@ -108,14 +108,9 @@ class Linearization:
     def process_covariance(self) -> Floats:
         """Covariance (N, 2n, 2n) that white forces of the intensities F add to the state in each step.
 
-        It is that of the continuous equation, equation (K1) of docs/mathematics.md, whatever the integrator draws:
-        the force of the noise moves q within the step, so that the covariance has rank 2n, while a single increment a
-        step has rank n and makes a filter overconfident. To leading order it is, for x = (q, p),
-
-            [[dt^3/3 M^-1 FF' M^-1, dt^2/2 M^-1 FF'], [dt^2/2 FF' M^-1, dt FF']]
-
-        For a damper of rate l (1/s) the variance of q is too small by the share l dt / 4, and for l dt above 1 that of
-        the second half is too large; smaller steps are right.
+        It is that of the continuous equation, (K1) of docs/mathematics.md, whatever the integrator draws: of rank 2n,
+        while a single increment a step has rank n and makes a filter overconfident. For a damper of rate l (1/s) the
+        variance of q is too small by the share l dt / 4, and for l dt above 1 that of the second half is too large.
 
         Raises:
             InputError: The scene has constraints.
@@ -123,11 +118,13 @@ class Linearization:
         if self.constrained:
             raise InputError("process_covariance() is of scenes without constraints")
         n = self.B.shape[1] // 2
-        # F, or M^-1 F: the jump at the end of the step. The one at its start has become A jump by then.
-        late: Floats = self.F
-        if not self.variational:
-            late = np.asarray(np.linalg.solve(self.J[:, n:], self.K[:, n:] @ late), dtype=np.float64)
-        return white_covariance(self.A, late @ np.swapaxes(late, 1, 2), self.dt)
+        jump = self.F if self.variational else np.linalg.solve(self.J[:, n:], self.K[:, n:] @ self.F)  # M^-1 F
+        late = np.concatenate([np.zeros_like(jump), jump], axis=1)
+        early = self.A @ late
+        middle, change = 0.5 * (early + late), early - late
+        # The variance of a share of the step, even in [0, 1], is 1/12.
+        found: Floats = middle @ np.swapaxes(middle, 1, 2) + change @ np.swapaxes(change, 1, 2) / 12.0
+        return self.dt * found
 
 
 def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | None = None) -> Linearization:
@@ -214,21 +211,6 @@ def linearize_steps(
         Gramp[..., scene.prescribed] = Gu[..., scene.prescribed]
     F = np.broadcast_to(start.F[:, :, : scene.processes], (steps, n, scene.processes))
     return Linearization(A, B, K, Jk, F, G, Gx, Gu, trajectory.dt, integrator.variational, ramp, Gramp)
-
-
-def white_covariance(A: Floats, spread: Floats, dt: float) -> Floats:
-    """Covariances (N, 2n, 2n) of steps with derivatives A under white jumps of the state's second half.
-
-    ``spread`` (N, n, n) is their covariance in a unit of time. A jump at time s before the end of a step is taken to
-    reach it as the line, in s, from the jump itself to A times it: (K1).
-    """
-    n = spread.shape[1]
-    through = A[:, :, n:] @ spread
-    found: Floats = through @ np.swapaxes(A[:, :, n:], 1, 2)
-    found[:, :, n:] += 0.5 * through
-    found[:, n:] += 0.5 * np.swapaxes(through, 1, 2)
-    found[:, n:, n:] += spread
-    return (dt / 3.0) * found
 
 
 @dataclass(frozen=True, eq=False)

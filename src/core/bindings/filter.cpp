@@ -44,14 +44,9 @@ Filtered filter(Model& model, std::size_t n, nb::handle log) {
     std::copy_n(field<In<2>>(log, "covariance", {d, d}), d * d, predicted_covariance.data());
     const auto [outcome, done] = [&] {
         nb::gil_scoped_release release;
-        return Filter<Model>(model, static_cast<int>(n), d > 2 * n)
-            .run(view, {.predicted = predicted.data(),
-                        .predicted_covariance = predicted_covariance.data(),
-                        .state = state.data(),
-                        .covariance = covariance.data(),
-                        .transition = transition.data(),
-                        .innovations = innovations.data(),
-                        .rows = rows.data()});
+        return Filter<Model>(model, static_cast<int>(n), static_cast<int>(d))
+            .run(view, {predicted.data(), predicted_covariance.data(), state.data(), covariance.data(),
+                        transition.data(), innovations.data(), rows.data()});
     }();
     return {predicted,  predicted_covariance, state, covariance,
             transition, innovations,          rows,  static_cast<std::int64_t>(outcome),
@@ -61,12 +56,12 @@ Filtered filter(Model& model, std::size_t n, nb::handle log) {
 Filtered filter_variational(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
                             nb::handle log) {
     if (mechanism.constraints.rows() > 0) throw std::invalid_argument("a filter takes no constraints");
-    VariationalModel model(mechanism, tableau, tolerance, guards, kernels_of(mechanism));
+    VariationalLinearization model(mechanism, tableau, tolerance, guards, kernels_of(mechanism));
     return filter(model, static_cast<std::size_t>(mechanism.dof()), log);
 }
 
 Filtered filter_explicit(const Mechanism& mechanism, ExplicitMethod method, nb::handle log) {
-    ExplicitModel model(mechanism, method);
+    ExplicitStepper model(mechanism, method, true);
     return filter(model, static_cast<std::size_t>(mechanism.dof()), log);
 }
 

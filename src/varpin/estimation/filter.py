@@ -5,7 +5,7 @@ Equations (K1) and (K2) of docs/mathematics.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -37,9 +37,6 @@ _ROUNDING = 1e-6
 # Steps between two samples that are too many: they take hours.
 _MOST = 1e9
 
-# The fields of an estimate that tell of the states.
-_STATES = ("q", "v", "covariance", "external", "external_covariance")
-
 
 @dataclass(frozen=True, eq=False)
 class Estimate(Frozen):
@@ -54,8 +51,8 @@ class Estimate(Frozen):
         external_covariance: Covariance of their errors (K, n, n), or None.
         innovations: Samples minus their predictions from the samples before (K, n) [rad or m], with those of measured
             velocities (K, 2n) [rad/s or m/s]; NaN where a sample is missing.
-        forward: Moments of the filter's state before and after each sample, and derivatives of predictions: (q, p) for
-            variational integrators and (q, v) for the others, then the external forces.
+        forward: Moments of the filter's state before and after each sample, and derivatives of predictions: of (q, p)
+            or (q, v), then of the external forces.
         given: What the filter was given, in the form of the core.
         joint_names: The joints of the columns.
         integrator: Whose steps these are, as text.
@@ -68,13 +65,13 @@ class Estimate(Frozen):
     q: Floats
     v: Floats
     covariance: Floats
-    external: Floats | None
-    external_covariance: Floats | None
-    forward: FilterArrays = field(repr=False)
-    given: FilterLog = field(repr=False)
+    forward: FilterArrays
+    given: FilterLog
     joint_names: tuple[str, ...]
     integrator: str
     variational: bool
+    external: Floats | None = None
+    external_covariance: Floats | None = None
     smoothed: bool = False
     warnings: tuple[Finding, ...] = ()
 
@@ -97,32 +94,31 @@ class Estimate(Frozen):
     @cached_property
     def gains(self) -> Floats:
         """Gains of the filter (K, d, z): what a unit of an innovation moves the state; 0 for missing samples."""
-        S, _, present = self._present
-        HP = self.forward.rows @ self.forward.predicted_covariance[:, : 2 * self.q.shape[1]]
-        return np.swapaxes(np.linalg.solve(S, HP * present[:, :, None]), 1, 2)
+        # P C' R^-1, with P after the sample, is (K2)'s gain.
+        CP = self.forward.rows @ self.forward.covariance[:, : 2 * self.q.shape[1]]
+        gains = np.swapaxes(CP, 1, 2) / self.given.variance
+        return np.where(np.isfinite(self.innovations)[:, None], gains, 0.0)
 
     @cached_property
-    def _present(self) -> tuple[Floats, Floats, np.ndarray[tuple[int, ...], np.dtype[np.bool_]]]:
-        """S with rows of the unit matrix and innovations with 0 for missing samples, and which are there."""
-        present = np.isfinite(self.innovations)
-        both = present[:, :, None] & present[:, None]
-        S = np.where(both, self.S, np.eye(present.shape[1]))
-        return S, np.where(present, self.innovations, 0.0), present
+    def _independent(self) -> tuple[Floats, Floats]:
+        """Innovations (K, z) as independent numbers of variance 1, 0 for missing ones; log sqrt det S (K,)."""
+        there = np.isfinite(self.innovations)
+        L = np.linalg.cholesky(np.where(there[:, :, None] & there[:, None], self.S, np.eye(there.shape[1])))
+        e = np.linalg.solve(L, np.nan_to_num(self.innovations)[:, :, None])[:, :, 0]
+        return np.asarray(e), np.asarray(np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1))
 
     @cached_property
     def log_likelihood(self) -> float:
         """Logarithm of the density of all samples, given the start and the scene."""
-        S, _, present = self._present
-        bits = np.linalg.slogdet(S)[1].sum() + present.sum() * np.log(2.0 * np.pi)
-        return float(-0.5 * (self.nis().sum() + bits))
+        samples = np.isfinite(self.innovations).sum()
+        return float(-0.5 * (self.nis().sum() + samples * np.log(2.0 * np.pi)) - self._independent[1].sum())
 
     def nis(self) -> Floats:
         """Normalized squares of the innovations (K,): of as many degrees of freedom as a sample has numbers.
 
         Means far above that number tell of noise that is larger than given, or of a scene that is wrong.
         """
-        S, e, _ = self._present
-        return _squares(S, e)
+        return np.asarray((self._independent[0] ** 2).sum(axis=1))
 
     def nees(self, q: ArrayLike, v: ArrayLike) -> Floats:
         """Normalized squares of the errors of (q, v) against a known motion (K,): of 2n degrees of freedom.
@@ -135,7 +131,8 @@ class Estimate(Frozen):
             InputError: A shape is wrong, or a value is not finite.
         """
         off = [finite_array(name, x, own.shape) - own for name, x, own in (("q", q, self.q), ("v", v, self.v))]
-        return _squares(self.covariance, np.concatenate(off, axis=1))
+        e = np.concatenate(off, axis=1)[:, :, None]
+        return np.asarray((e * np.linalg.solve(self.covariance, e)).sum(axis=(1, 2)))
 
 
 def kalman_filter(
@@ -166,8 +163,7 @@ def kalman_filter(
             momentum observer for encoders alone.
 
     Other Args:
-        dt: Longest step [s]: each interval of the log is covered by equal steps. If left out, one step from sample to
-            sample, and more over gaps.
+        dt: Longest step [s] of the equal ones in an interval; if left out, they have one each, and more in gaps.
         q0: Mean of the position at the first sample [rad or m]; if left out, that sample.
         v0: Mean of the velocity there [rad/s or m/s]; if left out, the difference of the first two samples.
         covariance: Covariance of (q0, v0) (2n, 2n); if left out, a hundred times the standard deviations of the first
@@ -190,17 +186,20 @@ def kalman_filter(
             "noise=varpin.AdditiveNoise(intensity)) says how strong the forces are that it does not know"
         )
     joints, n = scene.robot.joint_names, scene.robot.dof
-    measured, variance = _measured(log, q_noise, v_noise)
-    q, *start = _first_samples(log, variance[:n])
-    for at, (name, given) in enumerate({"q0": q0, "v0": v0}.items()):
-        start[at] = start[at] if given is None else joint_array(name, given, joints)
+    measured, variance = log.q, variances("q_noise", q_noise, joints)
+    q, first, rate, P = _first_samples(log, variance)
+    if v_noise is not None:
+        if log.v is None:
+            raise InputError("v_noise is given, and the log has no velocities v")
+        measured = np.concatenate([log.q, log.v], axis=1)
+        variance = np.concatenate([variance, variances("v_noise", v_noise, joints)])
+    first = first if q0 is None else joint_array("q0", q0, joints)
+    rate = rate if v0 is None else joint_array("v0", v0, joints)
     if covariance is not None:
-        start[2] = require_covariance(finite_array("covariance", covariance, (2 * n, 2 * n)))
+        P = require_covariance(finite_array("covariance", covariance, (2 * n, 2 * n)))
     parts, h = _steps(log.t, dt)
-    integrator = given_integrator(integrator)
-    if integrator is None:
-        integrator = usual_integrator(scene, start[0], start[1], float(h.max()), noisy=False)
-    mean, P = _of_state(scene, *start, variational=integrator.variational)
+    method = given_integrator(integrator) or usual_integrator(scene, first, rate, float(h.max()), noisy=False)
+    mean, P = _of_state(scene, first, rate, P, variational=method.variational)
     strength, kept = np.zeros(n), np.zeros(len(h))
     if external is not None:
         strength, kept = _external(external, joints, h)
@@ -208,11 +207,11 @@ def kalman_filter(
     F = scene.noise.fields(q[:-1], np.zeros_like(q[:-1]), log.u[:-1], q[0]).F
     force, spread = log.u[:-1] @ scene.actuation.T, F @ np.swapaxes(F, 1, 2)
     added = (1.0 - kept[:, None] ** 2) * strength
-    seen = FilterLog(mean, P, measured, variance, parts, h, *map(np.ascontiguousarray, (force, spread, kept, added)))
-    found = integrator.filtered(scene, seen)
-    states = _in_velocities(scene, found.state, found.covariance, variational=integrator.variational)
-    text, variational = str(integrator), integrator.variational
-    return Estimate(log.t, *states, found, seen, joints, text, variational, warnings=log.warnings)
+    seen = FilterLog(mean, P, measured, variance, parts, h, force, spread, kept, added)
+    found = method.filtered(scene, seen)
+    states = _in_velocities(scene, found.state, found.covariance, variational=method.variational)
+    own: dict[str, Any] = {"joint_names": joints, "integrator": str(method), "variational": method.variational}
+    return Estimate(log.t, forward=found, given=seen, warnings=log.warnings, **own, **states)
 
 
 def smooth(scene: Scene, log: Log | Trajectory, *, q_noise: JointValues, **options: Any) -> Estimate:
@@ -223,19 +222,7 @@ def smooth(scene: Scene, log: Log | Trajectory, *, q_noise: JointValues, **optio
     """
     found = kalman_filter(scene, log, q_noise=q_noise, **options)
     states = _in_velocities(scene, *_backward(found.forward), variational=found.variational)
-    return found.changed(**dict(zip(_STATES, states, strict=True)), smoothed=True)
-
-
-def _measured(log: Log, q_noise: JointValues, v_noise: JointValues | None) -> tuple[Floats, Floats]:
-    """The samples (K, z) of a log in the robot's order, and the variances (z,) of their errors."""
-    joints = log.joints or ()
-    variance = variances("q_noise", q_noise, joints)
-    if v_noise is None:
-        return np.ascontiguousarray(log.q), variance
-    if log.v is None:
-        raise InputError("v_noise is given, and the log has no velocities v")
-    both = np.ascontiguousarray(np.concatenate([log.q, log.v], axis=1))
-    return both, np.concatenate([variance, variances("v_noise", v_noise, joints)])
+    return found.changed(**states, smoothed=True)
 
 
 def variances(name: str, value: JointValues, joints: tuple[str, ...]) -> Floats:
@@ -290,40 +277,26 @@ def _of_state(scene: Scene, q: Floats, v: Floats, P: Floats, *, variational: boo
     return np.concatenate([q, M @ v]), to @ P @ to.T
 
 
-def _in_velocities(
-    scene: Scene, x: Floats, P: Floats, *, variational: bool
-) -> tuple[Floats, Floats, Floats, Floats | None, Floats | None]:
-    """q, v, their covariance, and external forces with theirs, from moments (K, d), (K, d, d) of the filter's state."""
+def _in_velocities(scene: Scene, x: Floats, P: Floats, *, variational: bool) -> dict[str, Any]:
+    """The states of an estimate from moments (K, d), (K, d, d) of the filter's state."""
     n = scene.robot.dof
-    q, v, covariance = x[:, :n].copy(), x[:, n : 2 * n].copy(), P[:, : 2 * n, : 2 * n].copy()
+    q, v, more = (part.copy() for part in np.split(x, [n, 2 * n], axis=1))
+    covariance, of_more = P[:, : 2 * n, : 2 * n].copy(), P[:, 2 * n :, 2 * n :]
     if variational:
-        M, _ = node_jets(scene, q, v)
-        v = np.ascontiguousarray(np.linalg.solve(M, v[:, :, None])[:, :, 0])
-        lower = velocity_at_nodes(scene, q, v)
-        cross = lower @ covariance
-        covariance[:, n:, :n] = cross[:, :, :n]
-        covariance[:, :n, n:] = np.swapaxes(cross[:, :, :n], 1, 2)
-        covariance[:, n:, n:] = cross @ np.swapaxes(lower, 1, 2)
-    more = x.shape[1] > 2 * n
-    return q, v, covariance, *((x[:, 2 * n :], P[:, 2 * n :, 2 * n :]) if more else (None, None))
+        v = np.asarray(np.linalg.solve(node_jets(scene, q, v)[0], v[:, :, None])[:, :, 0])
+        to = np.tile(np.eye(2 * n), (len(q), 1, 1))
+        to[:, n:] = velocity_at_nodes(scene, q, v)
+        covariance = to @ covariance @ np.swapaxes(to, 1, 2)
+    known = {"q": q, "v": v, "covariance": covariance}
+    return known | ({"external": more, "external_covariance": of_more} if more.size else {})
 
 
 def _backward(found: FilterArrays) -> tuple[Floats, Floats]:
     """Smoothed moments (K, d), (K, d, d) of the filter's state."""
     x, P = found.state.copy(), found.covariance.copy()
-    before, ahead = found.predicted_covariance[1:], found.transition @ P[:-1]
-    # In units of the deviations: momenta of light joints are 1e-6 and less.
-    scale = np.sqrt(np.diagonal(before, axis1=1, axis2=2))[:, :, None]
-    back = np.swapaxes(np.linalg.solve(before / (scale * np.swapaxes(scale, 1, 2)), ahead / scale) / scale, 1, 2)
+    before = found.predicted_covariance[1:]
+    back = np.swapaxes(np.linalg.solve(before, found.transition @ P[:-1]), 1, 2)
     for k in range(len(x) - 2, -1, -1):
         x[k] += back[k] @ (x[k + 1] - found.predicted[k + 1])
         P[k] += back[k] @ (P[k + 1] - before[k]) @ back[k].T
     return x, 0.5 * (P + np.swapaxes(P, 1, 2))
-
-
-def _squares(S: Floats, e: Floats) -> Floats:
-    """The e' S^-1 e of each row, in units of the deviations."""
-    scale = np.sqrt(np.diagonal(S, axis1=1, axis2=2))
-    scaled, y = S / (scale[:, :, None] * scale[:, None]), e / scale
-    found: Floats = np.einsum("Ki,Ki->K", y, np.linalg.solve(scaled, y[:, :, None])[:, :, 0])
-    return found

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import logging
 import os
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.errors import FileError, InputError, UnknownJoint
 from varpin.finding import Finding, announce
-from varpin.io.archive import atomic_file, members_of, read_npz, write_npz
+from varpin.io.archive import atomic_file, read_npz, save_npz
 from varpin.mechanics.scene import Scene
 from varpin.model import degrees_hint, joint_unit
 from varpin.support.checks import as_floats, is_file, path_like, require_finite, tuple_of
@@ -32,6 +32,8 @@ _SLOW = 0.5
 _BEYOND = 0.1
 # Fewest samples of a joint: fewer tell no velocity.
 _LEAST = 2
+# The arrays of a log in files, of which the first three must be there.
+_ENTRIES = ("t", "q", "u", "v", "joints", "controls")
 
 logger = logging.getLogger(__name__)
 
@@ -66,13 +68,10 @@ class Log(Frozen):
         t = require_finite("Log t", as_floats("Log t", self.t))
         if t.ndim != 1 or len(t) < _LEAST:
             raise InputError(f"Log t must have shape (K,) with at least {_LEAST} samples, got {t.shape}")
-        back = np.flatnonzero(np.diff(t) <= 0.0)
-        if back.size:
-            k = int(back[0]) + 1
-            raise InputError(
-                f"Log t must increase, and t[{k}] = {t[k]:.9g} s follows {t[k - 1]:.9g} s: sort the rows by time and "
-                "drop repeated ones"
-            )
+        k = int(np.argmin(np.diff(t)))
+        if t[k + 1] <= t[k]:
+            late = f"t[{k + 1}] = {t[k + 1]:.9g} s follows {t[k]:.9g} s"
+            raise InputError(f"Log t must increase, and {late}: sort the rows by time and drop repeated ones")
         q, u = _rows("Log q", self.q, len(t)), require_finite("Log u", _rows("Log u", self.u, len(t)))
         v = None if self.v is None else _rows("Log v", self.v, len(t))
         if v is not None and v.shape != q.shape:
@@ -85,11 +84,8 @@ class Log(Frozen):
         vars(self).update(t=t, q=q, u=u, v=v, joints=joints, controls=_names("controls", controls, u.shape[1]))
 
     def __repr__(self) -> str:
-        missing = 100.0 * float(np.isnan(self.q).mean())
-        return (
-            f"Log({len(self.t)} samples in {self.t[-1] - self.t[0]:g} s, {self.q.shape[1]} joints, "
-            f"{self.u.shape[1]} controls, {missing:.3g} % missing)"
-        )
+        (samples, joints), controls = self.q.shape, self.u.shape[1]
+        return f"Log({samples} samples in {self.t[-1] - self.t[0]:g} s, {joints} joints, {controls} controls)"
 
     @staticmethod
     def load(path: str | os.PathLike[str], joints: Sequence[str] | None = None) -> Log:
@@ -108,9 +104,13 @@ class Log(Frozen):
             InputError: The file's log is none, see :class:`Log`.
         """
         source = path_like("path", path)
-        read = _from_npz if source.suffix == ".npz" else _from_csv
-        given = read(source)
-        return Log(**given if joints is None else given | {"joints": tuple_of("joints", joints, str)})
+        if source.suffix == ".npz":
+            given = {name: np.asarray(entry) for name, entry in read_npz(source).items() if name in _ENTRIES}
+            if lost := [name for name in _ENTRIES[:3] if name not in given]:
+                raise FileError(f"{source}: {lost[0]} is missing; a log has arrays t, q and u")
+        else:
+            given = _from_csv(source)
+        return Log(**given if joints is None else given | {"joints": joints})
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write ``.npz``, or else CSV, which needs the names ``joints`` and ``controls``; returns the path.
@@ -121,15 +121,14 @@ class Log(Frozen):
         """
         target = path_like("path", path)
         if target.suffix == ".npz":
-            return write_npz(target, FORMAT, members_of(self))
+            return save_npz(target, FORMAT, self)
         if self.joints is None or self.controls is None:
             raise InputError("a CSV file names its columns: give the log's joints and controls, or save it as .npz")
-        columns = [("q", self.joints, self.q), ("u", self.controls, self.u)]
-        columns += [] if self.v is None else [("v", self.joints, self.v)]
-        head = ["t", *(f"{kind}_{name}" for kind, names, _ in columns for name in names)]
-        rows = np.column_stack([self.t, *(values for _, _, values in columns)])
+        kinds = [("q", self.joints), ("u", self.controls), *([] if self.v is None else [("v", self.joints)])]
+        head = ",".join(["t", *(f"{kind}_{name}" for kind, names in kinds for name in names)])
+        rows = np.column_stack([self.t, *(getattr(self, kind) for kind, _ in kinds)])
         with atomic_file(target) as stream:
-            np.savetxt(stream, rows, "%.17g", ",", header=",".join(head), comments="", encoding="utf-8")
+            np.savetxt(stream, rows, "%.17g", ",", header=head, comments="", encoding="utf-8")
         return target
 
     def matched(self, scene: Scene) -> Log:
@@ -140,10 +139,8 @@ class Log(Frozen):
             InputError: Columns are missing or too many, or a joint has fewer than two samples.
         """
         names = scene.robot.joint_names
-        to_q = _order("q", self.joints, names, self.q.shape[1])
-        to_u = _order("u", self.controls if scene.control_joints else None, scene.control_joints, self.u.shape[1])
-        if self.u.shape[1] != scene.controls:
-            raise InputError(f"the log has {self.u.shape[1]} columns of u, the scene {scene.controls} controls")
+        to_q = _order("q", self.joints, names, self.q.shape[1], len(names))
+        to_u = _order("u", self.controls, scene.control_joints, self.u.shape[1], scene.controls)
         q, u, v = self.q[:, to_q], self.u[:, to_u], None if self.v is None else self.v[:, to_q]
         few = np.flatnonzero(np.isfinite(q).sum(axis=0) < _LEAST)
         if few.size:
@@ -171,107 +168,76 @@ def _rows(name: str, given: Any, rows: int) -> Floats:
     array = as_floats(name, given)
     if array.ndim != 2 or len(array) != rows:
         raise InputError(f"{name} must have a row for each of the {rows} times, got shape {array.shape}")
-    require_finite(name, np.nan_to_num(array, posinf=np.inf, neginf=-np.inf))
+    require_finite(name, np.where(np.isnan(array), 0.0, array))
     return array
 
 
 def _names(what: str, given: Any, columns: int) -> tuple[str, ...] | None:
     if given is None:
         return None
-    names = tuple_of(f"Log {what}", given, str)
+    names = tuple(map(str, tuple_of(f"Log {what}", given, str)))
     if len(names) != columns or len(set(names)) != columns:
         raise InputError(f"Log {what} must be {columns} different names, one for each column, got {names}")
     return names
 
 
-def _order(kind: str, given: Sequence[str] | None, names: Sequence[str] | None, columns: int) -> list[int]:
+def _order(
+    kind: str, given: tuple[str, ...] | None, names: tuple[str, ...] | None, columns: int, wanted: int
+) -> list[int]:
     """Where the columns of ``names`` are among the ``given`` ones; as they are if either has no names."""
-    if given is None or names is None:
-        if names is not None and columns != len(names):
-            raise InputError(f"the log has {columns} columns of {kind}, the scene has {', '.join(names)}")
-        return list(range(columns))
-    for name in given:
-        if name not in names:
-            raise UnknownJoint(name, names, f"the log's {kind} names a joint that the scene does not have,")
-    if lost := [name for name in names if name not in given]:
-        raise InputError(f"the log has no column of {kind} of joint {lost[0]!r}")
-    return [given.index(name) for name in names]
+    known, own = names or (), given or ()
+    if known and (strange := [name for name in own if name not in known]):
+        raise UnknownJoint(strange[0], known, f"the log's {kind} names a joint that the scene does not have,")
+    if columns != wanted:
+        of = f", of {', '.join(known)}" if known else ""
+        raise InputError(f"the log has {columns} columns of {kind}, the scene {wanted}{of}")
+    return [own.index(name) for name in known] if known and own else list(range(columns))
 
 
 def _doubts(scene: Scene, t: Floats, q: Floats, u: Floats) -> Iterator[Finding]:
     """What is doubtful about a log in the scene's order, the worst first."""
-    robot, steps = scene.robot, np.diff(t)
-    usual, longest = float(np.median(steps)), int(np.argmax(steps))
+    names, steps = scene.robot.joint_names, np.diff(t)
+    usual, at = float(np.median(steps)), int(np.argmax(steps))
     if usual > _SLOW:
         text = f"the log has a sample every {usual:.4g} s: t looks like milliseconds, and times are in seconds"
         yield Finding("clock of the log", text, value=usual, unit="s")
-    with np.errstate(all="ignore"):
-        least, most = np.nanmin(q, axis=0), np.nanmax(q, axis=0)
-    if sentence := degrees_hint(robot, "q", np.where(-least > most, least, most)):
-        yield Finding("log in degrees", sentence)
-    else:
-        yield from _outside(scene, least, most)
-    yield from _dead(scene, most == least, u)
-    if steps[longest] > _GAP * usual:
-        gap, at = float(steps[longest]), float(t[longest])
-        text = f"the log has no samples for {gap:.4g} s after t = {at:.6g} s, {gap / usual:.3g} times its usual step"
-        yield Finding("gap in the log", text, time=at, value=gap, unit="s")
-
-
-def _outside(scene: Scene, least: Floats, most: Floats) -> Iterator[Finding]:
+    least, most = np.nanmin(q, axis=0), np.nanmax(q, axis=0)
     lower, upper = scene.robot.position_limits
     beyond = np.maximum(lower - least, most - upper)
-    joint = int(np.argmax(beyond))
-    if beyond[joint] > _BEYOND:
-        name, unit, far = scene.robot.joint_names[joint], joint_unit(scene.robot, joint), float(beyond[joint])
-        text = f"q of {name!r} is up to {far:.3g} {unit} beyond its limits: its columns may be in another order"
-        yield Finding("log beyond limits", text, name, value=far, unit=unit)
-
-
-def _dead(scene: Scene, still: Floats, u: Floats) -> Iterator[Finding]:
-    """Encoders that read one number to the last bit while a control that changes acts on their joints."""
-    driven = (scene.actuation != 0.0) @ (np.ptp(u, axis=0) > 0.0)
+    far = int(np.argmax(beyond))
+    if sentence := degrees_hint(scene.robot, "q", np.where(-least > most, least, most)):
+        yield Finding("log in degrees", sentence)
+    elif beyond[far] > _BEYOND:
+        unit = joint_unit(scene.robot, far)
+        text = f"q of {names[far]!r} is {beyond[far]:.3g} {unit} beyond its limits: columns may be in another order"
+        yield Finding("log beyond limits", text, names[far], value=float(beyond[far]), unit=unit)
+    still, driven = most == least, (scene.actuation != 0.0) @ (np.ptp(u, axis=0) > 0.0)
+    # An encoder that reads one number to the last bit while a control that changes acts on its joint.
     for joint in np.flatnonzero(still & driven & (not still.all())):
-        name = scene.robot.joint_names[joint]
-        text = (
-            f"q of {name!r} is one number throughout, though its control changes: its encoder may be dead, and missing "
-            "samples are NaN"
-        )
-        yield Finding("dead encoder", text, name)
-
-
-def _from_npz(source: Path) -> dict[str, Any]:
-    members = read_npz(source)
-    if lost := [name for name in ("t", "q", "u") if name not in members]:
-        raise FileError(f"{source}: {lost[0]} is missing; a log has arrays t, q and u")
-    given: dict[str, Any] = {name: np.asarray(members[name]) for name in ("t", "q", "u", "v") if name in members}
-    return given | {
-        name: tuple(np.asarray(members[name]).tolist()) for name in ("joints", "controls") if name in members
-    }
+        text = f"q of {names[joint]!r} is one number throughout: its encoder may be dead, and missing samples are NaN"
+        yield Finding("dead encoder", text, names[joint])
+    if steps[at] > _GAP * usual:
+        text = f"the log has no samples for {steps[at]:.4g} s after t = {t[at]:.6g} s, its usual step is {usual:.3g} s"
+        yield Finding("gap in the log", text, time=float(t[at]), value=float(steps[at]), unit="s")
 
 
 def _from_csv(source: Path) -> dict[str, Any]:
     if not is_file(source):
         raise FileError(f"there is no file {source}")
     try:
-        with source.open(newline="", encoding="utf-8-sig") as stream:
-            head = [cell.strip() for cell in next(csv.reader(stream), [])]
-            rows = np.loadtxt(stream, delimiter=",", ndmin=2, converters=_cell, encoding="utf-8", comments=None)
-    except (OSError, ValueError) as error:
+        # NumPy warns of a file without rows.
+        with warnings.catch_warnings(action="error"), source.open(encoding="utf-8-sig") as stream:
+            # Names as they are: NumPy would take signs out of them. Text that is no number is refused.
+            table = np.genfromtxt(
+                stream, delimiter=",", names=True, autostrip=True, deletechars="", replace_space=" ", loose=False
+            )
+    except (OSError, ValueError, UserWarning) as error:
         raise FileError(f"cannot read {source}: {error}") from None
-    if rows.size and rows.shape[1] != len(head):
-        raise FileError(f"{source}: the first line has {len(head)} names, the others {rows.shape[1]} cells")
-    columns = dict(zip(head, rows.T, strict=False))
-    kinds = {kind: [name[2:] for name in head if name.startswith(f"{kind}_")] for kind in "quv"}
-    if "t" not in columns or not kinds["q"] or not kinds["u"] or sorted(kinds["v"]) not in ([], sorted(kinds["q"])):
+    names = table.dtype.names or ()
+    of = {kind: tuple(name[2:] for name in names if name.startswith(f"{kind}_")) for kind in "quv"}
+    if "t" not in names or not of["q"] or not of["u"] or sorted(of["v"]) not in ([], sorted(of["q"])):
         wanted = "t, q_<joint>..., u_<joint>... and, if there are any, v_<joint>... of the same joints as q"
-        raise FileError(f"{source}: the first line must name the columns {wanted}, got {', '.join(head)[:200]}")
-    kinds["v"] = kinds["q"] if kinds["v"] else []
-    given = {
-        kind: np.column_stack([columns[f"{kind}_{name}"] for name in names]) for kind, names in kinds.items() if names
-    }
-    return given | {"t": columns["t"], "joints": tuple(kinds["q"]), "controls": tuple(kinds["u"])}
-
-
-def _cell(text: str) -> float:
-    return float(text) if text.strip() else np.nan
+        raise FileError(f"{source}: the first line must name the columns {wanted}, got {', '.join(names)[:200]}")
+    of["v"] = of["q"] if of["v"] else ()
+    given = {kind: np.column_stack([table[f"{kind}_{name}"] for name in own]) for kind, own in of.items() if own}
+    return given | {"t": table["t"], "joints": of["q"], "controls": of["u"]}

@@ -214,6 +214,27 @@ void subtract_rows(double* row, int columns, int begin, int end, const Factor& f
     row[c] = sum;
 }
 
+namespace detail {
+
+// out (rows, columns) = a (rows, depth) b (depth, columns).
+inline void multiply(const double* a, const double* b, int rows, int depth, int columns, double* out) {
+    std::fill_n(out, rows * columns, 0.0);
+    for (int i = 0; i < rows; ++i) {
+        subtract_rows(
+            out + i * columns, columns, 0, depth, [&](int k) { return -a[i * depth + k]; },
+            [&](int k) { return b + k * columns; });
+    }
+}
+
+// Of a (n, n), in place.
+inline void transpose(double* a, int n) {
+    for (int i = 0; i < n; ++i) {
+        for (int j = 0; j < i; ++j) std::swap(a[i * n + j], a[j * n + i]);
+    }
+}
+
+}  // namespace detail
+
 // Overwrites B (size of the block, columns) by the X with L U X = B. Row i of the block is at x + (i - begin) * stride.
 inline void solve_lu_rows(const double* lu, int n, Block block, double* x, int columns, int stride) {
     const auto row = [&](int i) { return x + (i - block.begin) * stride; };

@@ -96,6 +96,35 @@ class ExplicitStepper {
         return true;
     }
 
+    // The same of x = (q, v), as VariationalLinearization::step; the jumps of v are M^-1 times the forces.
+    Outcome step(double h, double* x, const double* force, const double* external, double* Jx, double* Jf,
+                 double* spread) {
+        const int n = mechanism_->dof();
+        q.assign(x, x + n);
+        v.assign(x + n, x + 2 * n);
+        if (!dynamics.at(x, x + n)) return Outcome::singular;
+        for (int turn = 0; turn < 2; ++turn) {
+            for (int i = 0; i < n; ++i) dynamics.solve_mass(spread + i * n, spread + i * n);
+            detail::transpose(spread, n);
+        }
+        for (int i = 0; i < n; ++i) sum_[i] = force[i] + (external ? external[i] : 0.0);
+        if (!step(h, sum_.data())) return Outcome::singular;
+        std::fill_n(Jx, 4 * n * n, 0.0);
+        std::fill_n(Jf, 2 * n * n, 0.0);
+        write_derivatives(h, Jx, Jf);
+        std::copy_n(q.begin(), n, x);
+        std::copy_n(v.begin(), n, x + n);
+        return Outcome::solved;
+    }
+
+    // As VariationalLinearization::velocity.
+    bool velocity(const double* x, double* to, double* slopes) const {
+        const int n = mechanism_->dof();
+        std::copy_n(x + n, n, to);
+        for (int i = 0; i < n; ++i) slopes[i * 2 * n + n + i] = 1.0;
+        return true;
+    }
+
     // Write the derivatives of the last step in (q, v) and in the force to Jx (2n, 2n) and Jf (2n, n), whose entries
     // outside of blocks are zero already.
     void write_derivatives(double h, double* Jx, double* Jf) {
@@ -157,7 +186,8 @@ class ExplicitStepper {
     Nystroem coefficients_;
     bool derivatives_;
     std::vector<double> stage_q_ = zeros(mechanism_->dof()), stage_v_ = zeros(mechanism_->dof());
-    std::vector<double> a_[4];      // (n) of each stage
+    std::vector<double> sum_ = zeros(mechanism_->dof());  // of forces
+    std::vector<double> a_[4];                            // (n) of each stage
     std::vector<double> slope_[4];  // their derivatives (b, 3b) in q, v and force, block after block
     std::vector<double> row_ = zeros(3, mechanism_->dof());  // one row of their sum
 };

@@ -78,19 +78,20 @@ class VariationalLinearization {
         return in_parts(h, q, p, force, halvings, Jx, Jf, Jr, Jp);
     }
 
-    // The same of the next step of a path that has been moved to (q, p), in the parts that the guards require, with its
-    // end.
-    Outcome step(double h, const double* q, const double* p, const double* force, double* Jx, double* Jf, double* q1,
-                 double* p1) {
+    // Takes x = (q, p) to the end of a step, in the parts that the guards require, with its derivatives Jx in x and Jf
+    // in the external force (n), which may be null. `spread` (n, n), the covariance of forces in a unit of time,
+    // becomes that of the jumps of p, which it is.
+    Outcome step(double h, double* x, const double* force, const double* external, double* Jx, double* Jf, double*) {
+        take_external(external);
         stepper.take_force(force, varies);
-        Outcome outcome = stepper.step_from(h, q, p, state);
+        Outcome outcome = stepper.step_from(h, x, x + n, state);
         if (outcome == Outcome::solved) {
             stepper.equation.derivatives(h, dV, Jx, Jf);
         } else {
-            outcome = in_parts(h, q, p, force, {}, Jx, Jf, nullptr);
+            outcome = in_parts(h, x, x + n, force, {}, Jx, Jf, nullptr);
         }
-        std::copy(state.q.begin(), state.q.end(), q1);
-        std::copy(state.momentum.begin(), state.momentum.end(), p1);
+        std::copy(state.q.begin(), state.q.end(), x);
+        std::copy(state.momentum.begin(), state.momentum.end(), x + n);
         return outcome;
     }
 
@@ -104,11 +105,11 @@ class VariationalLinearization {
         return Outcome::solved;
     }
 
-    // v = M(q)^-1 p and its derivatives (n, 2n) in (q, p); false where M(q) is not positive definite.
-    bool velocity(const double* q, const double* p, double* v, double* slopes) {
-        if (!stepper.move_to(q, p, state)) return false;
+    // v = M(q)^-1 p and its derivatives in x = (q, p), into zeros (n, 2n); false where M(q) is not positive definite.
+    bool velocity(const double* x, double* v, double* slopes) {
+        if (!stepper.move_to(x, x + n, state)) return false;
         std::copy(state.v.begin(), state.v.end(), v);
-        stepper.equation.kernels.velocity_slopes(stepper.mechanism, 1, q, v, slopes);
+        stepper.equation.kernels.velocity_slopes(stepper.mechanism, 1, x, v, slopes);
         return true;
     }
 
