@@ -37,15 +37,16 @@ def ur5() -> tuple[vp.Scene, vp.Scene, np.ndarray]:
 
 
 def tracking(scene: vp.Scene, middle: np.ndarray, seed: int) -> Law:
-    """Computed torques along sums of sines of 0.3 to 2 Hz, up to 4 rad/s."""
-    n, rng = scene.robot.dof, np.random.default_rng(seed)
+    """Computed torques within their limits along sums of sines of 0.3 to 2 Hz, which grow from rest in a second."""
+    n, rng, limit = scene.robot.dof, np.random.default_rng(seed), scene.robot.effort_limit
     phase, rate = rng.uniform(0.0, 2.0 * np.pi, (3, n)), rng.uniform(0.3, 2.0, (3, n))
-    size = 0.25 * rng.uniform(0.5, 1.0, (3, n)) / rate
+    size = 0.2 * rng.uniform(0.5, 1.0, (3, n)) / rate
 
     def law(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        goal = middle + np.sum(size * np.sin(2.0 * np.pi * rate * t + phase), axis=0)
+        goal = middle + min(t, 1.0) * np.sum(size * np.sin(2.0 * np.pi * rate * t + phase), axis=0)
         M = scene.core.jets(q[None], v[None])[0][0]
-        return scene.holding_torque(q) + M @ (200.0 * (goal - q) - 20.0 * v) + scene.damping * v
+        torque = scene.holding_torque(q) + M @ (200.0 * (goal - q) - 20.0 * v) + scene.damping * v
+        return np.clip(torque, -limit, limit)
 
     return law
 
@@ -72,7 +73,11 @@ def table() -> None:
     truth, begin, middle = ur5()
     log = mujoco_log(truth, middle, tracking(truth, middle, 3), 4.0)
     again = vp.identify(truth, log, NAMES, q_noise=NOISE, dt=5e-3, integrator=vp.Gauss(3), delay=0.0)
-    print(f"MuJoCo and Gauss(3) with the same parameters differ by {np.abs(again.residuals[0]).max():.0e} rad at most")
+    apart, moved = np.abs(log.q - again.predicted_before[0]).max(), np.abs(again.values - again.start).max()
+    print(f"MuJoCo and Gauss(3) with the same parameters differ by {apart:.0e} rad, their parameters by {moved:.0e}")
+    noisy = vp.identify(begin, with_noise(log, 0), NAMES, q_noise=NOISE, delay=0.0)
+    spread = 100.0 * noisy.deviations / noisy.values
+    print(f"deviations by the encoders: {spread[:6].max():.2g} % of the worst damper, {spread[6]:.2g} % of the payload")
     print("\n| | " + " | ".join(f"{1e3 * dt:g} ms" for dt in (5e-3, 1e-2, 2e-2)) + " |\n|---|---|---|---|")
     for method in METHODS:
         cells = []

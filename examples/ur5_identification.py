@@ -17,8 +17,8 @@ rate, phase = rng.uniform(0.3, 1.5, (2, 6)), rng.uniform(0.0, 2.0 * np.pi, (2, 6
 
 
 def law(t, q, v):
-    """Computed torques along sums of sines, held for 10 ms."""
-    goal = middle + np.sum(0.2 / rate * np.sin(2.0 * np.pi * rate * t + phase), axis=0)
+    """Computed torques along sums of sines that grow from rest, held for 10 ms."""
+    goal = middle + min(t, 1.0) * np.sum(0.2 / rate * np.sin(2.0 * np.pi * rate * t + phase), axis=0)
     M = vp.lagrangian_jet(arm, q, v).Lvv
     return arm.holding_torque(q) + M @ (200.0 * (goal - q) - 20.0 * v)
 
@@ -34,5 +34,5 @@ print(found)
 off = (found.values - np.append(damping, 2.0)) / found.deviations
 print("errors in standard deviations:", off.round(1))
 figure, _ = vp.plots.plot_identification(found, joints=["elbow_joint", "wrist_1_joint"])
-figure.savefig(out / "identification.png", dpi=150)
+figure.savefig(out / "identification.png", dpi=110)
 print(found.save_urdf(out / "ur5_identified.urdf"))
