@@ -66,6 +66,8 @@ _NAMED = 1e-3
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-12, 1e6
 # Standard deviations of a delay, and residuals in units of the encoders' noise, that are told.
 _SURE, _MISFIT = 4.0, 2.0
+# Doubts about a log from which no value could be right.
+_NEVER = ("dead encoder", "clock of the log")
 # Residual in units of the noise that stands for a motion that cannot be simulated.
 _LOST = 1e8
 
@@ -205,8 +207,8 @@ def identify(
     matched, apart = (tuple(as_log(each).matched(scene) for each in some) for some in (given, others))
     if v_noise is not None and any(log.v is None for log in (*matched, *apart)):
         raise InputError("v_noise is given, and a log has no velocities v")
-    for doubt in (doubt for log in (*matched, *apart) for doubt in log.warnings if doubt.kind == "dead encoder"):
-        raise InputError(f"{doubt}; values from it would be wrong: give a log in which the joint moves, or lock it")
+    for doubt in (doubt for log in (*matched, *apart) for doubt in log.warnings if doubt.kind in _NEVER):
+        raise InputError(f"{doubt}; values from this log would be wrong")
     step = min(float(np.median(np.diff(log.t))) for log in matched) if dt is None else positive("dt", dt, "s")
     length = _HORIZON if horizon is None else real("horizon", horizon)
     late = None if delay is None else finite("delay", delay)
@@ -462,6 +464,7 @@ class _Stretch:
             rows.append((log.v[self.samples] / fit.v_deviation)[np.isfinite(log.v[self.samples])])
         return np.concatenate(rows)
 
+    @np.errstate(over="ignore", invalid="ignore")
     def residuals(
         self, scene: Scene, varied: Sequence[Varied], delay: float, x0: Floats
     ) -> tuple[Floats, Floats, Floats] | None:
@@ -483,8 +486,9 @@ class _Stretch:
         in_v = by.in_velocities(x)[:, n:]
         if by.variational:
             in_v[:, :, 2 * n : -1] += by.shift
-        J = self._weighed(x[:, :n], in_v)
-        return self._weighed(motion.q, motion.v) - self.measured, J[:, : 2 * n], J[:, 2 * n :]
+        J, r = self._weighed(x[:, :n], in_v), self._weighed(motion.q, motion.v) - self.measured
+        # Those of motions that fly apart overflow, and so do their squares.
+        return (r, J[:, : 2 * n], J[:, 2 * n :]) if np.isfinite(np.vdot(J, J) + r @ r) else None
 
     def fitted(self, scene: Scene, varied: Sequence[Varied], late: float) -> tuple[Floats, Floats]:
         """Residuals (r,) at the best start, and derivatives in parameters and delay (r, P + 1) as the start follows."""
@@ -702,17 +706,6 @@ def _doubts(fit: _Fit, made: Identification, changes: Floats) -> list[Finding]:
             "motions with these values cannot be simulated from all starts: take a smaller dt, or other values to begin"
         )
         found.append(Finding("lost", text))
-    by_noise = np.divide(np.abs(changes), made.deviations, out=np.zeros_like(changes), where=made.deviations > 0.0)
-    k = int(np.argmax(by_noise))
-    if not by_noise[k] <= 1.0:
-        higher = "" if fit.integrator.order > 2 else " or a method of higher order, such as varpin.Gauss(2)"
-        text = (
-            f"half the step changes {made.names[k]} by {changes[k]:.3g} {made.units[k]}, {by_noise[k]:.3g} standard "
-            f"deviations: take a smaller dt{higher}"
-        )
-        found.append(Finding("step", text, value=float(changes[k]), unit=made.units[k]))
-    if made.status == "evaluations":
-        found.append(Finding("evaluations", "the search ended at its most evaluations: evaluations= allows more"))
     squares = [np.square(own / fit.deviation) for own in made.residuals]
     together = np.concatenate(squares)
     there = np.isfinite(together)
@@ -729,6 +722,17 @@ def _doubts(fit: _Fit, made: Identification, changes: Floats) -> list[Finding]:
             "payload, noise), or its column, clock or q_noise is wrong"
         )
         found.append(Finding("misfit", text, joint, value=float(by_joint[worst])))
+    by_noise = np.divide(np.abs(changes), made.deviations, out=np.zeros_like(changes), where=made.deviations > 0.0)
+    k = int(np.argmax(by_noise))
+    if not by_noise[k] <= 1.0:
+        higher = "" if fit.integrator.order > 2 else " or a method of higher order, such as varpin.Gauss(2)"
+        text = (
+            f"half the step changes {made.names[k]} by {changes[k]:.3g} {made.units[k]}, {by_noise[k]:.3g} standard "
+            f"deviations: take a smaller dt{higher}"
+        )
+        found.append(Finding("step", text, value=float(changes[k]), unit=made.units[k]))
+    if made.status == "evaluations":
+        found.append(Finding("evaluations", "the search ended at its most evaluations: evaluations= allows more"))
     if fit.delay is None and abs(made.delay) > max(_SURE * made.delay_deviation, 1e-2 * fit.dt):
         text = f"the controls act {1e3 * made.delay:.3g} ms later than the logs say, which the values allow for"
         if abs(made.delay) >= _LATEST:

@@ -1,0 +1,108 @@
+"""Logs as they come from arms, with what is wrong with them: one clear error, a warning that fits, or right values."""
+
+import functools
+
+import numpy as np
+import pytest
+from refusals import naming, refused
+
+import varpin as vp
+
+NOISE = 2e-4
+TRUTH = np.array([2.0, 1.5, 1.0, 0.3, 0.2, 0.1, 2.0])
+NAMES = ["damping", "payload"]
+MIDDLE = np.array([0.0, -1.2, 1.2, -0.5, 0.5, 0.0])
+ORDER = [2, 1, 0, 3, 4, 5]  # as joint states come by name, the elbow first
+
+
+def start():
+    return vp.Scene(vp.load_robot("ur5"), damping=0.0)
+
+
+@functools.cache
+def measured(late=0):
+    """Times, positions with noise and torques of a UR5 whose torques act ``late`` ms later than they are told."""
+    scene = vp.Scene(vp.load_robot("ur5", payload=vp.Payload("tool0", 2.0)), damping=TRUTH[:6])
+    rng, N = np.random.default_rng(3), 150
+    phase, rate, size = rng.uniform(0, 6, (3, 6)), rng.uniform(0.3, 1.5, (3, 6)), rng.uniform(0.1, 0.2, (3, 6))
+
+    def law(t, q, v):
+        goal = MIDDLE + np.sum(size / rate * (np.sin(2.0 * np.pi * rate * t + phase) - np.sin(phase)), axis=0)
+        M = scene.core.jets(q[None], v[None])[0][0]
+        return scene.holding_torque(q) + M @ (200.0 * (goal - q) - 20.0 * v) + scene.damping * v
+
+    options = {"dt": 1e-3, "steps": 10 * N, "integrator": vp.Gauss(3), "check": False}
+    motion = vp.simulate(scene, MIDDLE, np.zeros(6), controls=law, period=10, **options)
+    told = motion.u
+    if late:
+        acting = np.concatenate([np.repeat(told[:1], late, axis=0), told])[: 10 * N]
+        motion = vp.simulate(scene, MIDDLE, np.zeros(6), controls=acting, **options)
+    q = motion.q[::10] + NOISE * np.random.default_rng(0).standard_normal((N + 1, 6))
+    return motion.t[::10], q, told[np.r_[0 : 10 * N : 10, -1]]
+
+
+def found(t, q, u, joints=None, **options):
+    return vp.identify(start(), vp.Log(t, q, u, joints=joints), NAMES, q_noise=NOISE, **options)
+
+
+def off(each):
+    """The farthest value in units of its deviation."""
+    return np.abs((each.values - TRUTH) / each.deviations).max()
+
+
+def spoiled(values, at, by):
+    changed = values.copy()
+    changed[at] = by
+    return changed
+
+
+REFUSED = {
+    "milliseconds": (lambda t, q, u: (1e3 * t, q, u), ("10 s", "milliseconds")),
+    "a dead encoder": (lambda t, q, u: (t, spoiled(q, np.s_[:, 3], 0.0), u), ("'wrist_1_joint'", "encoder")),
+    "a dead encoder's gaps": (lambda t, q, u: (t, spoiled(q, np.s_[:, 3], np.nan), u), ("'wrist_1_joint'", "samples")),
+    "gaps in the controls": (lambda t, q, u: (t, q, spoiled(u, (50, 2), np.nan)), ("u[50, 2]", "nan")),
+    "rows out of order": (lambda t, q, u: (spoiled(t, 50, 0.2), q, u), ("t[50]", "sort")),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_no_value_could_be_right_from_is_refused(what):
+    change, facts = REFUSED[what]
+    with refused(vp.InputError, *facts):
+        found(*change(*measured()))
+
+
+WARNED = {
+    "a clock that is fast by 1 %": (lambda t, q, u: (1.01 * t, q, u), ("clock", "q_noise")),
+    "columns in another order": (lambda t, q, u: (t, q[:, ORDER], u[:, ORDER]), ("column", "q_noise")),
+    "an encoder that dies": (lambda t, q, u: (t, spoiled(q, np.s_[70:, 3], q[70, 3]), u), ("q_noise",)),
+    "an encoder with its sign turned": (lambda t, q, u: (t, q * [1, 1, -1, 1, 1, 1], u), ("column", "q_noise")),
+    "torques in other units": (lambda t, q, u: (t, q, 1e3 * u), ("column", "q_noise")),
+}
+
+
+SLOW = ("columns in another order", "torques in other units")
+
+
+@pytest.mark.parametrize("what", [pytest.param(x, marks=[pytest.mark.slow] if x in SLOW else []) for x in WARNED])
+@pytest.mark.filterwarnings("error")
+def test_what_does_not_fit_is_told_first(what):
+    each = found(*WARNED[what][0](*measured()), evaluations=5)
+    assert naming(each.warnings[:1], *WARNED[what][1]), each.warnings
+    assert off(each) > 10.0
+
+
+@pytest.mark.parametrize("what", ["as it is", "named columns", "gaps", "an epoch's clock", "late torques"])
+def test_values_are_right_all_the_same(what):
+    late = 8 * (what == "late torques")
+    t, q, u = measured(late)
+    names = tuple(start().robot.joint_names[k] for k in ORDER)
+    given = {
+        "named columns": (t, q[:, ORDER], u[:, ORDER], names),
+        "gaps": (t, np.where(np.random.default_rng(1).random(q.shape) < 0.1, np.nan, q), u),
+        "an epoch's clock": (t + 1.7e9, q, u),
+    }
+    each = found(*given.get(what, (t, q, u)))
+    assert off(each) < 5.0
+    assert each.delay == pytest.approx(1e-3 * late, abs=1e-4)
+    assert bool(naming(each.warnings, "controls", "later")) == bool(late)
