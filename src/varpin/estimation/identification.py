@@ -702,9 +702,7 @@ def _step_error(fit: _Fit, runs: Sequence[_Run], y: Floats) -> Floats:
 def _doubts(fit: _Fit, made: Identification, changes: Floats) -> list[Finding]:
     found = []
     if fit.least >= _LOST**2:
-        text = (
-            "motions with these values cannot be simulated from all starts: take a smaller dt, or other values to begin"
-        )
+        text = "motions with these values cannot be simulated: a column or its unit is wrong, or dt is too long"
         found.append(Finding("lost", text))
     squares = [np.square(own / fit.deviation) for own in made.residuals]
     together = np.concatenate(squares)
