@@ -77,11 +77,10 @@ WARNED = {
     "columns in another order": (lambda t, q, u: (t, q[:, ORDER], u[:, ORDER]), ("column", "q_noise")),
     "an encoder that dies": (lambda t, q, u: (t, spoiled(q, np.s_[70:, 3], q[70, 3]), u), ("q_noise",)),
     "an encoder with its sign turned": (lambda t, q, u: (t, q * [1, 1, -1, 1, 1, 1], u), ("column", "q_noise")),
-    "torques in other units": (lambda t, q, u: (t, q, 1e3 * u), ("column", "unit")),
 }
 
 
-SLOW = ("columns in another order", "torques in other units")
+SLOW = ("columns in another order",)
 
 
 @pytest.mark.parametrize("what", [pytest.param(x, marks=[pytest.mark.slow] if x in SLOW else []) for x in WARNED])
