@@ -1,0 +1,417 @@
+"""The fit of parameters to logs: logs on the grid of the steps, their stretches, residuals and derivatives.
+
+Equation (I1) of docs/mathematics.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from varpin.arrays import Floats
+from varpin.errors import InputError, LinearizationError, RobotError, SingularMassMatrix
+from varpin.estimation.consistency import Body
+from varpin.estimation.filter import kalman_filter, variances
+from varpin.estimation.log import GAP, Log
+from varpin.estimation.parameters import INERTIAL, Parameters
+from varpin.estimation.sensitivity import motion_map
+from varpin.integrators import Integrator
+from varpin.integrators.base import Varied
+from varpin.linearization import linearize_steps
+from varpin.mechanics.scene import Scene
+from varpin.signals.commands import open_loop
+from varpin.simulation.record import rollout
+from varpin.support.checks import JointValues
+from varpin.trajectory import Trajectory
+
+# Shortest stretches [s], with which the search begins, before each is twice as long: from a scene without friction or
+# payload, motions of a second are too far from the log to lead back.
+_FIRST = 0.2
+# Expected decrease of the cost at which a first search ends, as a share of the cost, and the last one, as a share of
+# what one residual has in it: by a quarter of a deviation of a value. Where values are well told, the search is then
+# far closer, as it converges quadratically; inertias that logs hardly tell would go on for hundreds of evaluations.
+_LOOSE, _TIGHT = 1e-3, 0.05
+# Most corrections of a stretch's start for given parameters, and the share of its cost below which it is found: later
+# evaluations go on from it.
+_CORRECTIONS, _FOUND = 6, 1e-8
+# Most trials of a correction, each a quarter as long: where dry friction turns, whole ones lead astray.
+_SHORTENED = 12
+# Samples from which a stretch's start is guessed, by a parabola.
+_GUESSED = 8
+# Longest delay of the controls that is looked for [s]: buses and drives have some milliseconds.
+LATEST = 0.1
+# Damping of a step in units of the squared column sizes: at first and after a step that was not right, where steps are,
+# and where no step helps any more.
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-12, 1e6
+# Residual in units of the noise that stands for a motion that cannot be simulated.
+LOST = 1e8
+
+
+class Fit:
+    """What all evaluations share: y are coordinates of the parameters, then the delay if it is unknown."""
+
+    def __init__(
+        self,
+        of: Parameters,
+        integrator: Integrator,
+        dt: float,
+        horizon: float,
+        q_noise: JointValues,
+        v_noise: JointValues | None,
+        delay: float | None,
+        callback: Callable[[int, float], None] | None,
+    ) -> None:
+        self.of, self.integrator, self.dt, self.delay, self.callback = of, integrator, dt, delay, callback
+        self.q_noise, self.v_noise, self.horizon = q_noise, v_noise, horizon
+        if not horizon > 0.0:
+            raise InputError(f"horizon must be positive [s], or np.inf for whole logs, got {horizon:g}")
+        names = of.scene.robot.joint_names
+        self.deviation = np.sqrt(variances("q_noise", q_noise, names))
+        self.v_deviation = None if v_noise is None else np.sqrt(variances("v_noise", v_noise, names))
+        self.bodies = _bodies(of)
+        self.prior = [c for columns, _ in self.bodies for c in columns]
+        self.size = len(of.names) + (delay is None)
+        # L and F are linear in all parameters together, but for gains of servos and for springs with their rests.
+        self.varied = of.varied()
+        self.linear = not any(name.startswith(("servo", "rest", "stiffness")) for name in of.names)
+        self.best, self.least, self.done = np.zeros(self.size), np.inf, 0
+        self.jacobian = np.zeros((1, self.size))
+
+    @cached_property
+    def begin(self) -> Floats:
+        """The coordinates of the scene's own values (P,)."""
+        y = self.of.values.copy()
+        for columns, _ in self.bodies:
+            y[columns] = 0.0
+        return y
+
+    def values(self, y: Floats) -> tuple[Floats, Floats]:
+        """The parameters' values (P,) and their derivatives in y (P, size)."""
+        P = len(self.of.names)
+        values, slopes = y[:P].copy(), np.eye(P, self.size)
+        for columns, body in self.bodies:
+            values[columns], slopes[np.ix_(columns, columns)] = body.numbers(y[columns])
+        return values, slopes
+
+    def late(self, y: Floats) -> float:
+        """The delay [s]."""
+        return float(y[-1]) if self.delay is None else self.delay
+
+    def doublings(self, runs: Sequence[Run]) -> int:
+        """How often the first stretches are doubled."""
+        longest = min(self.horizon, max(run.duration for run in runs))
+        return max(0, int(np.floor(np.log2(longest / _FIRST))))
+
+    def changed(self, scene: Scene, values: Floats) -> tuple[Varied, ...]:
+        """The scenes around the parameters of a scene with ``values`` (P,)."""
+        return self.varied if self.linear else replace(self.of, scene=scene, values=values).varied()
+
+    def search(
+        self, evaluate: Callable[[Floats], tuple[Floats, Floats]], y: Floats, evaluations: int, *, last: bool
+    ) -> tuple[Floats, str]:
+        """The y of least squares from ``y``, and how it ended."""
+        P, prior = len(self.of.names), self.prior
+        lower, upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
+        lower[:P] = np.where(np.isin(np.arange(P), prior), -np.inf, self.of.least)
+        lower[P:], upper[P:] = -LATEST, LATEST
+
+        def at(y: Floats) -> tuple[Floats, Floats, float]:
+            try:
+                with np.errstate(over="ignore", invalid="ignore"):
+                    r, J = evaluate(y)
+            except RobotError:
+                # A step too far: inertias that are not finite.
+                r, J = np.full(len(self.jacobian), LOST), np.zeros_like(self.jacobian)
+            self.done += 1
+            both = np.concatenate([r, y[prior]])
+            cost = float(both @ both)
+            if cost < self.least:
+                self.best, self.least, self.jacobian = y, cost, J
+            if self.callback is not None:
+                self.callback(self.done, float(np.sqrt(r @ r / len(r))))
+            return both, np.concatenate([J, np.eye(self.size)[prior]]), cost
+
+        self.least, damping = np.inf, _FIRST_DAMPING
+        r, J, cost = at(np.clip(y, lower, upper))
+        y = self.best
+        for _ in range(evaluations):
+            # The method of Levenberg and Marquardt within bounds; what moves nothing stays.
+            sizes = np.linalg.norm(J, axis=0)
+            weights = np.sqrt(damping) * np.where(sizes > 0.0, sizes, 1.0)
+            system = np.concatenate([J, np.diag(weights)]), -np.concatenate([r, np.zeros(self.size)])
+            step = lsq_linear(*system, (lower - y, upper - y), method="bvls").x
+            gain = cost - float(np.square(r + J @ step).sum())
+            if gain <= (_TIGHT / len(r) if last else _LOOSE) * cost:
+                return y, "converged"
+            trial = at(np.clip(y + step, lower, upper))
+            if trial[2] < cost:
+                y, (r, J, cost), damping = self.best, trial, max(0.3 * damping, _LEAST_DAMPING)
+            elif damping > _MOST_DAMPING:
+                return y, "converged"
+            else:
+                damping = max(10.0 * damping, _FIRST_DAMPING)
+        return y, "evaluations"
+
+
+def _bodies(of: Parameters) -> list[tuple[list[int], Body]]:
+    """The bodies of which all ten numbers are parameters, by the places of these."""
+    found = []
+    for k, name in enumerate(of.names):
+        own = [f"{name.rpartition(':')[0]}:{number}" for number in INERTIAL]
+        if name == own[0] and list(of.names[k : k + 10]) == own:
+            found.append((list(range(k, k + 10)), Body.around(of.values[k : k + 10])))
+    return found
+
+
+class Run:
+    """A log on the grid of the steps."""
+
+    def __init__(self, fit: Fit, log: Log) -> None:
+        self.fit, self.log, h = fit, log, fit.dt
+        self.starts: dict[int, Floats] = {}
+        self.known: tuple[float, tuple[Floats, Floats]] = (np.nan, (np.zeros(0), np.zeros(0)))
+        after = (log.t - log.t[0]) / h
+        self.duration = float(log.t[-1] - log.t[0])
+        self.steps = max(1, int(np.ceil(after[-1] - 1e-6)))
+        # A sample next to a node is at it, though clocks round.
+        near = np.abs(after - np.rint(after)) < max(1e-6, 4.0 * np.spacing(np.abs(log.t[-1])) / h)
+        after = np.where(near, np.rint(after), after)
+        self.node = np.minimum(after.astype(int), self.steps - 1)
+        self.share = after - self.node
+        # The integral of the held controls up to each sample.
+        held = np.diff(log.t)[:, None] * log.u[:-1]
+        self.integral = np.concatenate([np.zeros((1, log.u.shape[1])), np.cumsum(held, axis=0)])
+
+    def controls(self, delay: float) -> tuple[Floats, Floats]:
+        """The mean controls of the steps (N, m), and their derivatives in the delay."""
+        if self.known[0] == delay:
+            return self.known[1]
+        edges = self.log.t[0] + self.fit.dt * np.arange(self.steps + 1) - delay
+        at = np.clip(np.searchsorted(self.log.t, edges + 1e-9, side="right") - 1, 0, len(self.log.t) - 1)
+        u = self.log.u[at]
+        passed = self.integral[at] + (edges - self.log.t[at])[:, None] * u
+        self.known = delay, (np.diff(passed, axis=0) / self.fit.dt, -np.diff(u, axis=0) / self.fit.dt)
+        return self.known[1]
+
+    def settled(self, scene: Scene, late: float) -> list[Stretch]:
+        """The stretches after a search for their starts, by shorter ones as :func:`identify` itself."""
+        for finer in range(self.fit.doublings([self]), -1, -1):
+            stretches = self.stretches(2**finer)
+            for each in stretches:
+                each.fitted(scene, (), late)
+        return stretches
+
+    def stretches(self, finer: int = 1) -> list[Stretch]:
+        """The log in stretches of about the horizon, or this much shorter."""
+        parts = finer * max(1, round(self.duration / self.fit.horizon))
+        # What acts in a gap is not in the log.
+        gaps = np.flatnonzero(np.diff(self.log.t) > GAP * np.median(np.diff(self.log.t)))
+        cuts = np.concatenate([self.node[gaps] + 1, self.node[gaps + 1]])
+        ends = np.unique(np.concatenate([self.steps * np.arange(parts + 1) // parts, cuts]))
+        found = [Stretch(self, a, b) for a, b in pairwise(ends.tolist())]
+        return [each for each in found if each.samples.any()]
+
+
+class Stretch:
+    """Steps ``begin`` to ``end`` of a run, with the samples on them, and the start that was found last."""
+
+    def __init__(self, run: Run, begin: int, end: int) -> None:
+        self.run, self.begin, self.end = run, begin, end
+        last = end == run.steps
+        self.samples = (run.node >= begin) & ((run.node < end) | last)
+        if begin not in run.starts:
+            run.starts[begin] = self._guess()
+
+    def _guess(self) -> Floats:
+        """Positions and velocities at the first node by parabolas through the samples next to it."""
+        log, fit = self.run.log, self.run.fit
+        at = log.t[0] + self.begin * fit.dt
+        first = int(np.searchsorted(log.t, at - 1e-9))
+        found = np.zeros((2, fit.of.scene.robot.dof))
+        for joint in range(found.shape[1]):
+            there = np.flatnonzero(np.isfinite(log.q[:, joint]))
+            near = there[np.argsort(np.abs(there - first), kind="stable")[:_GUESSED]]
+            curve = np.polynomial.Polynomial.fit(log.t[near], log.q[near, joint], min(2, len(near) - 1))
+            found[:, joint] = curve(at), curve.deriv()(at)
+        return found.ravel()
+
+    def motion(self, scene: Scene, u: Floats, x0: Floats) -> Trajectory | None:
+        """The motion from a start; None where it cannot be simulated."""
+        n = scene.robot.dof
+        try:
+            motion, failure = rollout(scene, self.run.fit.integrator, x0[:n], x0[n:], open_loop(u), self.run.fit.dt)
+        except SingularMassMatrix:
+            return None
+        return None if failure is not None else motion
+
+    def at_samples(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
+        """Positions and velocities (k, n, ...) at the samples from those at the nodes (N + 1, n, ...), by cubics."""
+        run, h = self.run, self.run.fit.dt
+        k = run.node[self.samples] - self.begin
+        s = run.share[self.samples].reshape(-1, *[1] * (q.ndim - 1))
+        moved, a, b = q[k + 1] - q[k], h * v[k], h * v[k + 1]
+        bend, twist = 3.0 * moved - 2.0 * a - b, a + b - 2.0 * moved
+        # The nodes themselves where samples are at them.
+        at = np.where(s == 1.0, q[k + 1], q[k] + s * (a + s * (bend + s * twist)))
+        return at, np.where(s == 1.0, v[k + 1], (a + s * (2.0 * bend + 3.0 * s * twist)) / h)
+
+    def _weighed(self, q: Floats, v: Floats) -> Floats:
+        """Rows (r, ...) of the samples that are there, in units of their deviations."""
+        fit, log = self.run.fit, self.run.log
+        at_q, at_v = self.at_samples(q, v)
+        shape = (1, -1, *[1] * (q.ndim - 2))
+        rows = [(at_q / fit.deviation.reshape(shape))[np.isfinite(log.q[self.samples])]]
+        if fit.v_deviation is not None and log.v is not None:
+            rows.append((at_v / fit.v_deviation.reshape(shape))[np.isfinite(log.v[self.samples])])
+        return np.concatenate(rows)
+
+    @cached_property
+    def measured(self) -> Floats:
+        fit, log = self.run.fit, self.run.log
+        rows = [(log.q[self.samples] / fit.deviation)[np.isfinite(log.q[self.samples])]]
+        if fit.v_deviation is not None and log.v is not None:
+            rows.append((log.v[self.samples] / fit.v_deviation)[np.isfinite(log.v[self.samples])])
+        return np.concatenate(rows)
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def residuals(
+        self, scene: Scene, varied: Sequence[Varied], delay: float, x0: Floats
+    ) -> tuple[Floats, Floats, Floats] | None:
+        """Predictions minus samples (r,), and derivatives in start (r, 2n) and in parameters and delay (r, P + 1)."""
+        u, by_delay = (part[self.begin : self.end] for part in self.run.controls(delay))
+        motion = self.motion(scene, u, x0)
+        if motion is None:
+            return None
+        integrator, n = self.run.fit.integrator, scene.robot.dof
+        try:
+            linear = linearize_steps(scene, motion, integrator, motion.q[0])
+            D = integrator.in_parameters(scene, motion, varied) if varied else np.zeros((motion.steps, 2 * n, 0))
+        except LinearizationError:
+            return None
+        by = motion_map(scene, motion, varied, (linear.A, linear.B, D), variational=integrator.variational)
+        none, late = np.zeros((len(D), 2 * n, 2 * n)), linear.B @ by_delay[:, :, None]
+        begin = np.concatenate([by.by_q0, by.by_v0, by.by_theta, np.zeros((2 * n, 1))], axis=1)
+        x = by.forward(begin, np.concatenate([none, D, late], axis=2))
+        in_v = by.in_velocities(x)[:, n:]
+        if by.variational:
+            in_v[:, :, 2 * n : -1] += by.shift
+        J, r = self._weighed(x[:, :n], in_v), self._weighed(motion.q, motion.v) - self.measured
+        # Those of motions that fly apart overflow, and so do their squares.
+        return (r, J[:, : 2 * n], J[:, 2 * n :]) if np.isfinite(np.vdot(J, J) + r @ r) else None
+
+    def fitted(self, scene: Scene, varied: Sequence[Varied], late: float) -> tuple[Floats, Floats]:
+        """Residuals (r,) at the best start, and derivatives in parameters and delay (r, P + 1) as the start follows."""
+        x0 = self.run.starts[self.begin]
+        found = self.residuals(scene, (), late, x0)
+        for _ in range(_CORRECTIONS):
+            if found is None:
+                break
+            r, Jx, _ = found
+            step = np.linalg.lstsq(Jx, r, rcond=None)[0]
+            gain = 2.0 * float(step @ (Jx.T @ r)) - float(np.square(Jx @ step).sum())
+            if gain <= _FOUND * float(r @ r):
+                break
+            for _ in range(_SHORTENED):
+                trial = self.residuals(scene, (), late, x0 - step)
+                if trial is not None and trial[0] @ trial[0] < r @ r:
+                    break
+                step = 0.25 * step
+            else:
+                break
+            assert trial is not None
+            x0, found = x0 - step, trial
+        found = self.residuals(scene, varied, late, x0)
+        if found is None:
+            return np.full(self.measured.size, LOST), np.zeros((self.measured.size, len(varied) + 1))
+        r, Jx, J = found
+        self.run.starts[self.begin] = x0
+        along, _ = np.linalg.qr(Jx)
+        return r - along @ (along.T @ r), J - along @ (along.T @ J)
+
+
+def simulations(fit: Fit, stretches: Sequence[Stretch], y: Floats) -> tuple[Floats, Floats]:
+    """Residuals of all stretches and their derivatives in y, (I1)."""
+    values, slopes = fit.values(y)
+    scene = fit.of.scene_with(values)
+    varied, late = fit.changed(scene, values), fit.late(y)
+    before = [dict(each.run.starts) for each in stretches]
+    rows = [each.fitted(scene, varied, late) for each in stretches]
+    r, J = (np.concatenate(part) for part in zip(*rows, strict=True))
+    if float(r @ r) > fit.least:
+        # The next values are nearer to those before.
+        for each, starts in zip(stretches, before, strict=True):
+            each.run.starts = starts
+    return r, _in_coordinates(fit, J, slopes)
+
+
+def _in_coordinates(fit: Fit, J: Floats, slopes: Floats) -> Floats:
+    """Derivatives in y from those in the values and the delay (r, P + 1)."""
+    found: Floats = J[:, :-1] @ slopes
+    if fit.delay is None:
+        found[:, -1] = J[:, -1]
+    return found
+
+
+def predictions(fit: Fit, runs: Sequence[Run], y: Floats) -> tuple[Floats, Floats]:
+    """Innovations of all logs in units of their deviations, and derivatives in y; gains are taken as constant."""
+    values, slopes = fit.values(y)
+    scene = fit.of.scene_with(values)
+    varied, late = fit.changed(scene, values), fit.late(y)
+    found = [_innovations(fit, run, scene, varied, late) for run in runs]
+    r, J = (np.concatenate(part) for part in zip(*found, strict=True))
+    return r, _in_coordinates(fit, J, slopes)
+
+
+def _innovations(fit: Fit, run: Run, scene: Scene, varied: Sequence[Varied], late: float) -> tuple[Floats, Floats]:
+    """As :func:`predictions` for one log, in values and delay: one step from node to node of its grid."""
+    log = run.log
+    if not np.array_equal(run.node + run.share, np.arange(len(log.t))):
+        raise InputError("under noise the samples of a log must be evenly spaced by dt: leave dt out, or resample it")
+    u, by_delay = run.controls(late)
+    log = replace(log, u=np.concatenate([u, u[-1:]]))
+    try:
+        seen = kalman_filter(scene, log, q_noise=fit.q_noise, v_noise=fit.v_noise, dt=2.0 * fit.dt,
+                             integrator=fit.integrator)  # fmt: skip
+    except LinearizationError:
+        known = sum(part.measured.size for part in run.stretches())
+        return np.full(known, LOST), np.zeros((known, len(varied) + 1))
+    n, q, v = scene.robot.dof, seen.q, seen.v
+    motion = _through(scene, fit, seen.forward.state, q, v, u)
+    D = fit.integrator.in_parameters(scene, motion, varied)
+    B = linearize_steps(scene, motion, fit.integrator, q[0]).B
+    more = np.concatenate([D, B @ by_delay[:, :, None]], axis=2)
+    x = np.zeros((2 * n, more.shape[2]))
+    rows: list[Floats] = []
+    for k, (H, gain) in enumerate(zip(seen.forward.rows, seen.gains, strict=True)):
+        if k:
+            x = seen.forward.transition[k - 1] @ x + more[k - 1]
+        rows.append(-H @ x)
+        x = x + gain @ rows[-1]
+    there = np.isfinite(seen.innovations)
+    white = [np.linalg.cholesky(S[np.ix_(own, own)]) for S, own in zip(seen.S, there, strict=True)]
+    parts = zip(white, seen.innovations, rows, there, strict=True)
+    whitened = [np.linalg.solve(L, np.column_stack([e[own], J[own]])) for L, e, J, own in parts]
+    both = np.concatenate(whitened)
+    return both[:, 0], both[:, 1:]
+
+
+def _through(scene: Scene, fit: Fit, state: Floats, q: Floats, v: Floats, u: Floats) -> Trajectory:
+    """Steps of the filter, from each state to about the next, as a motion."""
+    first = rollout(scene.changed(), fit.integrator, q[0], v[0], open_loop(u[:1]), fit.dt)[0]
+    N, statistics = len(u), first.statistics
+    p = np.ascontiguousarray(state[:, scene.robot.dof : 2 * scene.robot.dof])
+    whole = {
+        name: np.zeros((N, *getattr(statistics, name).shape[1:]), getattr(statistics, name).dtype)
+        for name in ("newton_iterations", "jets", "sweeps", "residual", "branch_margin", "energy_defect")
+    }
+    return first.changed(
+        t=fit.dt * np.arange(N + 1.0),
+        q=q, v=v, p=p, u=u, dw=np.zeros((N, scene.processes)),
+        u_stages=np.zeros((N, 0, u.shape[1])), u_nodes=np.zeros((N + 1, 0)),
+        statistics=replace(statistics, substeps=np.ones(N, np.int64), halvings=statistics.halvings[:0], **whole),
+    )  # fmt: skip
