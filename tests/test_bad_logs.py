@@ -88,7 +88,7 @@ SLOW = ("columns in another order",)
 def test_what_does_not_fit_is_told_first(what):
     each = found(*WARNED[what][0](*measured()), evaluations=5)
     assert naming(each.warnings[:1], *WARNED[what][1]), each.warnings
-    assert off(each) > 10.0
+    assert np.abs(each.values / TRUTH - 1.0).max() > 0.02
 
 
 @pytest.mark.parametrize("what", ["as it is", "named columns", "gaps", "an epoch's clock", "late torques"])

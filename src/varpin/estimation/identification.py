@@ -54,8 +54,8 @@ class Identification(Frozen):
         values: Their values (P,).
         start: Those of the scene that was given (P,).
         units: Their units (P,).
-        covariance: Covariance of the errors of the values (P, P), for encoders of the given noise; infinite for what
-            the logs do not tell.
+        covariance: Covariance of the errors of the values (P, P), for encoders of the given noise, or for residuals as
+            large as they are if that is more; infinite for what the logs do not tell.
         delay: By how much the controls act later than the logs say [s].
         delay_deviation: Its standard deviation [s]; 0 for a delay that was given.
         null_space: What the logs do not tell, one sentence for each combination of parameters.
@@ -213,6 +213,8 @@ def _made(fit: Fit, y: Floats, runs: Sequence[Run], apart: Sequence[Run], status
     values, slopes = fit.values(y)
     scene, late, P = fit.of.scene_with(values), fit.late(y), len(fit.of.names)
     covariance, null = _covariance(fit, slopes, fit.prior)
+    # Where the residuals are larger than the encoders' noise, the values are less certain by as much.
+    covariance = covariance * max(1.0, fit.least / len(fit.jacobian))
     predicted, before = [], []
     for run in [*runs, *apart]:
         stretches = run.settled(scene, late)
