@@ -324,8 +324,8 @@ def _doubts(fit: Fit, made: Identification, changes: Floats) -> list[Finding]:
     if not by_joint[worst] <= _MISFIT and not fit.of.scene.processes:
         joint = fit.of.scene.robot.joint_names[worst]
         text = (
-            f"the residuals of {joint!r} are {by_joint[worst]:.3g} times q_noise: something else acts (friction, a "
-            "payload, noise), or its column, clock or q_noise is wrong"
+            f"the residuals of {joint!r} are {by_joint[worst]:.3g} times q_noise: something acts that is no "
+            "parameter (friction, a payload elsewhere), or its column, clock or q_noise is wrong"
         )
         found.append(Finding("misfit", text, joint, value=float(by_joint[worst])))
     by_noise = np.divide(np.abs(changes), made.deviations, out=np.zeros_like(changes), where=made.deviations > 0.0)
@@ -341,6 +341,8 @@ def _doubts(fit: Fit, made: Identification, changes: Floats) -> list[Finding]:
         found.append(Finding("evaluations", "the search ended at its most evaluations: evaluations= allows more"))
     if fit.delay is None and abs(made.delay) > max(_SURE * made.delay_deviation, 1e-2 * fit.dt):
         text = f"the controls act {1e3 * made.delay:.3g} ms later than the logs say, which the values allow for"
+        if any(each.kind == "misfit" for each in found):
+            text = f"a delay of {1e3 * made.delay:.3g} ms fits best, or stands for what the scene lacks"
         if abs(made.delay) >= LATEST:
             text = (
                 f"the delay of the controls is {LATEST:g} s or more, beyond what is looked for: give delay= or shift t"
