@@ -100,25 +100,30 @@ class Estimate(Frozen):
         return np.where(np.isfinite(self.innovations)[:, None], gains, 0.0)
 
     @cached_property
-    def _independent(self) -> tuple[Floats, Floats]:
-        """Innovations (K, z) as independent numbers of variance 1, 0 for missing ones; log sqrt det S (K,)."""
+    def _root(self) -> Floats:
+        """Cholesky factors of S (K, z, z), with rows of the unit matrix for missing samples."""
         there = np.isfinite(self.innovations)
-        L = np.linalg.cholesky(np.where(there[:, :, None] & there[:, None], self.S, np.eye(there.shape[1])))
-        e = np.linalg.solve(L, np.nan_to_num(self.innovations)[:, :, None])[:, :, 0]
-        return np.asarray(e), np.asarray(np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1))
+        S = np.where(there[:, :, None] & there[:, None], self.S, np.eye(there.shape[1]))
+        return np.asarray(np.linalg.cholesky(S))
+
+    def independent(self, rows: Floats) -> Floats:
+        """Rows (K, z, k) as S makes innovations independent numbers of variance 1; 0 for missing samples."""
+        there = np.isfinite(self.innovations)[:, :, None]
+        return np.asarray(np.linalg.solve(self._root, np.where(there, rows, 0.0)))
 
     @cached_property
     def log_likelihood(self) -> float:
         """Logarithm of the density of all samples, given the start and the scene."""
         samples = np.isfinite(self.innovations).sum()
-        return float(-0.5 * (self.nis().sum() + samples * np.log(2.0 * np.pi)) - self._independent[1].sum())
+        logs = np.log(np.diagonal(self._root, axis1=1, axis2=2)).sum()
+        return float(-0.5 * (self.nis().sum() + samples * np.log(2.0 * np.pi)) - logs)
 
     def nis(self) -> Floats:
         """Normalized squares of the innovations (K,): of as many degrees of freedom as a sample has numbers.
 
         Means far above that number tell of noise that is larger than given, or of a scene that is wrong.
         """
-        return np.asarray((self._independent[0] ** 2).sum(axis=1))
+        return np.asarray((self.independent(self.innovations[:, :, None]) ** 2).sum(axis=(1, 2)))
 
     def nees(self, q: ArrayLike, v: ArrayLike) -> Floats:
         """Normalized squares of the errors of (q, v) against a known motion (K,): of 2n degrees of freedom.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 
 import numpy as np
@@ -79,16 +79,20 @@ class Fit:
         # L and F are linear in all parameters together, but for gains of servos and for springs with their rests.
         self.varied = of.varied()
         self.linear = not any(name.startswith(("servo", "rest", "stiffness")) for name in of.names)
-        self.best, self.least, self.done = np.zeros(self.size), np.inf, 0
+        self.best, self.least, self.done = self.begin, np.inf, 0
         self.jacobian = np.zeros((1, self.size))
 
     @cached_property
     def begin(self) -> Floats:
-        """The coordinates of the scene's own values (P,)."""
-        y = self.of.values.copy()
-        for columns, _ in self.bodies:
-            y[columns] = 0.0
+        """The coordinates of the scene's own values and of no delay (size,)."""
+        y = np.zeros(self.size)
+        y[: len(self.of.names)] = self.of.values
+        y[self.prior] = 0.0
         return y
+
+    def with_prior(self, r: Floats, J: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Residuals and their derivatives in y, with those of the prior of bodies."""
+        return np.concatenate([r, y[self.prior]]), np.concatenate([J, np.eye(self.size)[self.prior]])
 
     def values(self, y: Floats) -> tuple[Floats, Floats]:
         """The parameters' values (P,) and their derivatives in y (P, size)."""
@@ -115,9 +119,10 @@ class Fit:
         self, evaluate: Callable[[Floats], tuple[Floats, Floats]], y: Floats, evaluations: int, *, last: bool
     ) -> tuple[Floats, str]:
         """The y of least squares from ``y``, and how it ended."""
-        P, prior = len(self.of.names), self.prior
+        P = len(self.of.names)
         lower, upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
-        lower[:P] = np.where(np.isin(np.arange(P), prior), -np.inf, self.of.least)
+        lower[:P] = self.of.least
+        lower[self.prior] = -np.inf
         lower[P:], upper[P:] = -LATEST, LATEST
 
         def at(y: Floats) -> tuple[Floats, Floats, float]:
@@ -128,13 +133,13 @@ class Fit:
                 # A step too far: inertias that are not finite.
                 r, J = np.full(len(self.jacobian), LOST), np.zeros_like(self.jacobian)
             self.done += 1
-            both = np.concatenate([r, y[prior]])
-            cost = float(both @ both)
+            both = self.with_prior(r, J, y)
+            cost = float(both[0] @ both[0])
             if cost < self.least:
                 self.best, self.least, self.jacobian = y, cost, J
             if self.callback is not None:
                 self.callback(self.done, float(np.sqrt(r @ r / len(r))))
-            return both, np.concatenate([J, np.eye(self.size)[prior]]), cost
+            return *both, cost
 
         self.least, damping = np.inf, _FIRST_DAMPING
         r, J, cost = at(np.clip(y, lower, upper))
@@ -199,8 +204,8 @@ class Run:
         return self.known[1]
 
     def settled(self, scene: Scene, late: float) -> list[Stretch]:
-        """The stretches after a search for their starts, by shorter ones as :func:`identify` itself."""
-        for finer in range(self.fit.doublings([self]), -1, -1):
+        """The stretches after a search for their starts, by shorter ones as :func:`identify` where none is known."""
+        for finer in range(0 if self.starts else self.fit.doublings([self]), -1, -1):
             stretches = self.stretches(2**finer)
             for each in stretches:
                 each.fitted(scene, (), late)
@@ -262,20 +267,19 @@ class Stretch:
 
     def _weighed(self, q: Floats, v: Floats) -> Floats:
         """Rows (r, ...) of the samples that are there, in units of their deviations."""
-        fit, log = self.run.fit, self.run.log
-        at_q, at_v = self.at_samples(q, v)
-        shape = (1, -1, *[1] * (q.ndim - 2))
-        rows = [(at_q / fit.deviation.reshape(shape))[np.isfinite(log.q[self.samples])]]
-        if fit.v_deviation is not None and log.v is not None:
-            rows.append((at_v / fit.v_deviation.reshape(shape))[np.isfinite(log.v[self.samples])])
-        return np.concatenate(rows)
+        return self._rows(*self.at_samples(q, v))
 
     @cached_property
     def measured(self) -> Floats:
-        fit, log = self.run.fit, self.run.log
-        rows = [(log.q[self.samples] / fit.deviation)[np.isfinite(log.q[self.samples])]]
+        """The samples that are there (r,), in units of their deviations."""
+        log = self.run.log
+        return self._rows(log.q[self.samples], log.q[self.samples] if log.v is None else log.v[self.samples])
+
+    def _rows(self, q: Floats, v: Floats) -> Floats:
+        fit, log, shape = self.run.fit, self.run.log, (1, -1, *[1] * (q.ndim - 2))
+        rows = [(q / fit.deviation.reshape(shape))[np.isfinite(log.q[self.samples])]]
         if fit.v_deviation is not None and log.v is not None:
-            rows.append((log.v[self.samples] / fit.v_deviation)[np.isfinite(log.v[self.samples])])
+            rows.append((v / fit.v_deviation.reshape(shape))[np.isfinite(log.v[self.samples])])
         return np.concatenate(rows)
 
     @np.errstate(over="ignore", invalid="ignore")
@@ -336,35 +340,33 @@ class Stretch:
 
 def simulations(fit: Fit, stretches: Sequence[Stretch], y: Floats) -> tuple[Floats, Floats]:
     """Residuals of all stretches and their derivatives in y, (I1)."""
-    values, slopes = fit.values(y)
-    scene = fit.of.scene_with(values)
-    varied, late = fit.changed(scene, values), fit.late(y)
-    before = [dict(each.run.starts) for each in stretches]
-    rows = [each.fitted(scene, varied, late) for each in stretches]
-    r, J = (np.concatenate(part) for part in zip(*rows, strict=True))
+    before = {each.run: dict(each.run.starts) for each in stretches}
+    r, J = _evaluated(fit, y, [each.fitted for each in stretches])
     if float(r @ r) > fit.least:
         # The next values are nearer to those before.
-        for each, starts in zip(stretches, before, strict=True):
-            each.run.starts = starts
-    return r, _in_coordinates(fit, J, slopes)
-
-
-def _in_coordinates(fit: Fit, J: Floats, slopes: Floats) -> Floats:
-    """Derivatives in y from those in the values and the delay (r, P + 1)."""
-    found: Floats = J[:, :-1] @ slopes
-    if fit.delay is None:
-        found[:, -1] = J[:, -1]
-    return found
+        for run, starts in before.items():
+            run.starts = starts
+    return r, J
 
 
 def predictions(fit: Fit, runs: Sequence[Run], y: Floats) -> tuple[Floats, Floats]:
     """Innovations of all logs in units of their deviations, and derivatives in y; gains are taken as constant."""
+    return _evaluated(fit, y, [partial(_innovations, fit, run) for run in runs])
+
+
+_Part = Callable[[Scene, Sequence[Varied], float], tuple[Floats, Floats]]
+
+
+def _evaluated(fit: Fit, y: Floats, parts: Sequence[_Part]) -> tuple[Floats, Floats]:
+    """Residuals and derivatives in y from those of parts in the values and the delay, (r,) and (r, P + 1)."""
     values, slopes = fit.values(y)
     scene = fit.of.scene_with(values)
     varied, late = fit.changed(scene, values), fit.late(y)
-    found = [_innovations(fit, run, scene, varied, late) for run in runs]
-    r, J = (np.concatenate(part) for part in zip(*found, strict=True))
-    return r, _in_coordinates(fit, J, slopes)
+    r, J = (np.concatenate(each) for each in zip(*(part(scene, varied, late) for part in parts), strict=True))
+    found: Floats = J[:, :-1] @ slopes
+    if fit.delay is None:
+        found[:, -1] = J[:, -1]
+    return r, found
 
 
 def _innovations(fit: Fit, run: Run, scene: Scene, varied: Sequence[Varied], late: float) -> tuple[Floats, Floats]:
@@ -393,16 +395,13 @@ def _innovations(fit: Fit, run: Run, scene: Scene, varied: Sequence[Varied], lat
         rows.append(-H @ x)
         x = x + gain @ rows[-1]
     there = np.isfinite(seen.innovations)
-    white = [np.linalg.cholesky(S[np.ix_(own, own)]) for S, own in zip(seen.S, there, strict=True)]
-    parts = zip(white, seen.innovations, rows, there, strict=True)
-    whitened = [np.linalg.solve(L, np.column_stack([e[own], J[own]])) for L, e, J, own in parts]
-    both = np.concatenate(whitened)
+    both = seen.independent(np.concatenate([seen.innovations[:, :, None], np.array(rows)], axis=2))[there]
     return both[:, 0], both[:, 1:]
 
 
 def _through(scene: Scene, fit: Fit, state: Floats, q: Floats, v: Floats, u: Floats) -> Trajectory:
     """Steps of the filter, from each state to about the next, as a motion."""
-    first = rollout(scene.changed(), fit.integrator, q[0], v[0], open_loop(u[:1]), fit.dt)[0]
+    first = rollout(scene, fit.integrator, q[0], v[0], open_loop(u[:1]), fit.dt)[0]
     N, statistics = len(u), first.statistics
     p = np.ascontiguousarray(state[:, scene.robot.dof : 2 * scene.robot.dof])
     whole = {

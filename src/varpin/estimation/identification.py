@@ -185,9 +185,7 @@ def identify(
     late = None if delay is None else finite("delay", delay)
     fit = Fit(of, chosen, step, length, q_noise, v_noise, late, callback)
     runs = [Run(fit, log) for log in matched]
-    y, status, evaluation = np.zeros(fit.size), "converged", count("evaluations", evaluations)
-    y[: len(of.names)] = fit.begin
-    fit.best = y
+    y, status, evaluation = fit.begin, "converged", count("evaluations", evaluations)
     try:
         if scene.processes:
             y, status = fit.search(partial(predictions, fit, runs), y, evaluation, last=True)
@@ -212,7 +210,7 @@ def _several(name: str, logs: Any) -> tuple[Any, ...]:
 def _made(fit: Fit, y: Floats, runs: Sequence[Run], apart: Sequence[Run], status: str) -> Identification:
     values, slopes = fit.values(y)
     scene, late, P = fit.of.scene_with(values), fit.late(y), len(fit.of.names)
-    covariance, null = _covariance(fit, slopes, fit.prior)
+    covariance, null = _covariance(fit, slopes)
     # Where the residuals are larger than the encoders' noise, the values are less certain by as much.
     covariance = covariance * max(1.0, fit.least / len(fit.jacobian))
     predicted, before = [], []
@@ -246,7 +244,7 @@ def _positions(run: Run, stretches: Sequence[Stretch], scene: Scene, late: float
     return found
 
 
-def _covariance(fit: Fit, slopes: Floats, prior: Sequence[int]) -> tuple[Floats, tuple[str, ...]]:
+def _covariance(fit: Fit, slopes: Floats) -> tuple[Floats, tuple[str, ...]]:
     """The covariance of values and delay (size, size), and what the logs do not tell in sentences."""
     J = fit.jacobian
     sizes = np.linalg.norm(J, axis=0)
@@ -257,7 +255,7 @@ def _covariance(fit: Fit, slopes: Floats, prior: Sequence[int]) -> tuple[Floats,
     # Of bodies the null space is that of their numbers.
     to = slopes.copy() if fit.delay is not None else np.vstack([slopes, np.eye(1, fit.size, fit.size - 1)])
     null = (rows[~known] / scale) @ to.T
-    joined = np.concatenate([J, np.eye(fit.size)[list(prior)]]) / scale
+    joined = fit.with_prior(np.zeros(len(J)), J, fit.best)[1] / scale
     _, spread, rows = np.linalg.svd(joined, full_matrices=False)
     known = spread > _NOTHING * max(spread[0], 1.0)
     root = (rows[known] / spread[known, None]) / scale
@@ -297,12 +295,12 @@ def _step_error(fit: Fit, runs: Sequence[Run], y: Floats) -> Floats:
     """What half the step changes in the values (P,), to first order."""
     finer = copy(fit)
     finer.dt *= 0.5
-    prior, steps = fit.prior, []
+    steps = []
     scene = fit.of.scene_with(fit.values(y)[0])
     for each, of in ((fit, runs), (finer, [Run(finer, run.log) for run in runs])):
         r, J = simulations(each, [part for run in of for part in run.settled(scene, fit.late(y))], y)
-        system = np.concatenate([J, np.eye(fit.size)[prior]]), np.concatenate([r, y[prior]])
-        steps.append(np.linalg.lstsq(*system, rcond=_NOTHING)[0])
+        both, slopes = fit.with_prior(r, J, y)
+        steps.append(np.linalg.lstsq(slopes, both, rcond=_NOTHING)[0])
     change: Floats = fit.values(y)[1] @ (steps[0] - steps[1])
     return change
 
