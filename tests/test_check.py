@@ -161,7 +161,10 @@ def test_unknown_error():
     assert "error unknown" in repr(motion)
 
 
-def test_interruption():
+def test_interruption(request):
+    # A process in the background of a script ignores Ctrl-C.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
     options = {"dt": 0.3, "steps": 1_000_000, "progress": lambda done, steps: signal.raise_signal(signal.SIGINT)}
     with pytest.raises(vp.Interrupted) as caught:
         moved(vp.Scene(vp.planar_chain(1)), EULER, start=([0.0], [0.0]), **options)

@@ -198,8 +198,18 @@ def test_what_is_refused_and_interrupted(caplog):
     dead[:, 4] = dead[0, 4]
     with refused(vp.InputError, "wrist_2_joint", "encoder"):
         vp.identify(scene, vp.Log(right.t, dead, right.u), NAMES, q_noise=NOISE)
-    with refused(vp.InputError, "logs"):
-        vp.identify(scene, [], NAMES, q_noise=NOISE)
+    for logs, names, facts in [
+        ([], NAMES, ("logs", "empty")),
+        (None, NAMES, ("logs", "varpin.Log", "NoneType")),
+        (right, [], ("parameters", "empty")),
+    ]:
+        with refused(vp.InputError, *facts):
+            vp.identify(scene, logs, names, q_noise=NOISE)
+    with refused(vp.InputError, "v_noise", "velocities"):
+        vp.identify(scene, right, NAMES, q_noise=NOISE, v_noise=0.1)
+    loop = vp.Scene(CHAIN, constraints=vp.JointTie("joint2", "joint1", [0.0, 1.0]))
+    with refused(vp.InputError, "identify", "JointTie"):
+        vp.identify(loop, right, NAMES, q_noise=NOISE)
     seen = []
 
     def stop(evaluation, residual):
