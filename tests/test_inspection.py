@@ -79,6 +79,17 @@ def test_inertia_that_its_shape_cannot_have():
     assert not [text for text in inspect_robot("ur10").warnings if "inertia" in text]
 
 
+@pytest.mark.parametrize(("x", "told"), [(0.12, False), (0.9, True)])
+def test_centre_of_mass_far_outside_of_its_shape(tmp_path, x, told):
+    """Arms of a maker give centres in the base's axes: their hands have them 1.4 m away from themselves."""
+    arm = write_arm(tmp_path, ROD, inertial(1, 0.001, 0.001, 0.001, x=x))
+    shape = '<visual><geometry><box size="0.2 0.1 0.1"/></geometry></visual>'
+    arm.write_text(arm.read_text().replace('<link name="link2">', f'<link name="link2">{shape}'))
+    warnings = naming(inspect_robot(arm).warnings, ("centre of mass", "'link2'", "0.8 m", "0.24 m"))
+    assert bool(warnings) == told
+    assert not inspect_robot(arm, meshes=False).warnings
+
+
 def test_one_line_for_each_kind(tmp_path):
     plate = inertial(1, 0.01, 0.02, 0.08)
     report = inspect_robot(write_arm(tmp_path, plate, plate, plate, plate, plate))
