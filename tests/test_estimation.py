@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from refusals import refused, unnamed
+from refusals import naming, refused, unnamed
 from scipy.stats import multivariate_normal
 
 import varpin as vp
@@ -394,6 +394,19 @@ def test_a_right_log_is_not_doubted(load, caplog):
     for own in (good(6), still):
         assert not vp.Log(**own).matched(vp.Scene(load("ur5"))).warnings
     assert not caplog.messages
+
+
+@pytest.mark.parametrize(("intensity", "told"), [(0.05, False), (0.005, True)])
+def test_innovations_that_noise_does_not_explain_are_told(intensity, told, caplog):
+    robot, rest = vp.planar_chain(2), np.zeros(2)
+    arm = vp.Scene(robot, gravity=np.zeros(3), damping=0.5, noise=vp.AdditiveNoise(0.05))
+    for seed in range(1 if told else 20):
+        motion = vp.simulate(arm, rest, rest, dt=1e-2, steps=100, rng=seed, check=False)
+        encoders = motion.q + ENCODER * np.random.default_rng(seed).standard_normal(motion.q.shape)
+        log = vp.Log(motion.t, encoders, np.vstack([motion.u, motion.u[-1:]]))
+        scene = vp.Scene(robot, gravity=np.zeros(3), damping=0.5, noise=vp.AdditiveNoise(intensity))
+        assert bool(naming(vp.smooth(scene, log, q_noise=ENCODER).warnings, "innovations")) == told
+    assert bool(caplog.messages) == told
 
 
 def test_what_a_filter_refuses():

@@ -224,6 +224,30 @@ def test_what_is_refused_and_interrupted(caplog):
     assert found.values[-1] > 0.5
 
 
+def test_ctrl_c_after_the_search_keeps_its_values(monkeypatch):
+    """Motions with the values and the check of the step come after it."""
+    calls = []
+
+    def interrupted(*given):
+        calls.append(given)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("varpin.estimation.identification._step_error", interrupted)
+    found = vp.identify(start(), log(), NAMES, q_noise=NOISE)
+    assert calls
+    assert found.status == "interrupted"
+    assert within(found, TRUTH)
+    assert np.isfinite(found.residuals[0]).all()
+
+
+def test_a_value_at_its_bound_is_told_where_less_would_fit():
+    still = log(damping=(0.0,) * 6)
+    for forces, told in [((), False), ((vp.FrameDamper("tool0", "base_link", 5.0),), True)]:
+        found = vp.identify(start(forces=forces), still, NAMES, q_noise=NOISE)
+        assert (found.values[:6] == 0.0).any()
+        assert any(each.kind == "bound" for each in found.warnings) == told, found.warnings
+
+
 def chain_log(scene, period=1e-2, samples=100, noise=1e-4, seed=0):
     """A chain under waves of torque, by steps of a tenth of the period."""
     n, rng = scene.robot.dof, np.random.default_rng(seed)

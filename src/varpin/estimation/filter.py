@@ -5,6 +5,7 @@ Equations (K1) and (K2) of docs/mathematics.md.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -17,7 +18,7 @@ from varpin.arrays import Floats
 from varpin.core.arrays import FilterArrays, FilterLog
 from varpin.errors import InputError
 from varpin.estimation.log import Log, as_log
-from varpin.finding import Finding
+from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
 from varpin.linearization import node_jets, require_covariance, velocity_at_nodes
 from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
@@ -36,6 +37,10 @@ _JITTER = 1.5
 _ROUNDING = 1e-6
 # Steps between two samples that are too many: they take hours.
 _MOST = 1e9
+# Innovations in units of their standard deviations that are told: of right models the mean of a hundred is 1 +- 0.07.
+MISFIT = 2.0
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +63,7 @@ class Estimate(Frozen):
         integrator: Whose steps these are, as text.
         variational: Whether the filter's state is (q, p) rather than (q, v).
         smoothed: Whether all samples tell of a state, and not those up to it alone.
-        warnings: What is doubtful about the log.
+        warnings: What is doubtful: innovations that are larger than expected, and the log.
     """
 
     t: Floats
@@ -182,6 +187,34 @@ def kalman_filter(
         LinearizationError: A step from an estimate has no solution.
     """
     log = as_log(log).matched(require_scene(scene))
+    found = filtered(scene, log, q_noise, v_noise, external, dt, q0, v0, covariance, integrator)
+    over = np.sqrt(found.nis().sum() / max(1, np.isfinite(found.innovations).sum()))
+    told = misfit(float(over))
+    announce(logger, scene.announced, float(np.median(np.diff(log.t))), told)
+    return found.changed(warnings=(*told, *log.warnings))
+
+
+def misfit(over: float) -> tuple[Finding, ...]:
+    """The warning of innovations that are so many times their standard deviations."""
+    if over <= MISFIT:
+        return ()
+    text = f"the innovations are {over:.3g} times what the scene's noise and q_noise explain: something else acts"
+    return (Finding("misfit", text, value=over),)
+
+
+def filtered(
+    scene: Scene,
+    log: Log,
+    q_noise: JointValues,
+    v_noise: JointValues | None = None,
+    external: tuple[JointValues, float] | None = None,
+    dt: float | None = None,
+    q0: JointValues | None = None,
+    v0: JointValues | None = None,
+    covariance: ArrayLike | None = None,
+    integrator: Integrator | None = None,
+) -> Estimate:
+    """As :func:`kalman_filter` for a log in the scene's order, without a word about what is doubtful."""
     refuse_constraints(scene, "a Kalman filter")
     if scene.noise.velocity_dependent:
         raise InputError("a Kalman filter does not take noise whose fields depend on the velocity")
@@ -216,7 +249,7 @@ def kalman_filter(
     found = method.filtered(scene, seen)
     states = _in_velocities(scene, found.state, found.covariance, variational=method.variational)
     own: dict[str, Any] = {"joint_names": joints, "integrator": str(method), "variational": method.variational}
-    return Estimate(log.t, forward=found, given=seen, warnings=log.warnings, **own, **states)
+    return Estimate(log.t, forward=found, given=seen, **own, **states)
 
 
 def smooth(scene: Scene, log: Log | Trajectory, *, q_noise: JointValues, **options: Any) -> Estimate:

@@ -16,7 +16,7 @@ from scipy.optimize import lsq_linear
 from varpin.arrays import Floats
 from varpin.errors import InputError, LinearizationError, RobotError, SingularMassMatrix
 from varpin.estimation.consistency import Body
-from varpin.estimation.filter import kalman_filter, variances
+from varpin.estimation.filter import filtered, variances
 from varpin.estimation.log import GAP, Log
 from varpin.estimation.parameters import INERTIAL, Parameters
 from varpin.estimation.sensitivity import motion_map
@@ -377,8 +377,7 @@ def _innovations(fit: Fit, run: Run, scene: Scene, varied: Sequence[Varied], lat
     u, by_delay = run.controls(late)
     log = replace(log, u=np.concatenate([u, u[-1:]]))
     try:
-        seen = kalman_filter(scene, log, q_noise=fit.q_noise, v_noise=fit.v_noise, dt=2.0 * fit.dt,
-                             integrator=fit.integrator)  # fmt: skip
+        seen = filtered(scene, log, fit.q_noise, fit.v_noise, dt=2.0 * fit.dt, integrator=fit.integrator)
     except LinearizationError:
         known = sum(part.measured.size for part in run.stretches())
         return np.full(known, LOST), np.zeros((known, len(varied) + 1))

@@ -18,6 +18,7 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
+from varpin.estimation.filter import MISFIT, misfit
 from varpin.estimation.fit import LATEST, LOST, Fit, Run, Stretch, predictions, simulations
 from varpin.estimation.log import Log, as_log
 from varpin.estimation.parameters import parameters_of
@@ -37,8 +38,8 @@ _HORIZON = 1.0
 _NOTHING = 1e-7
 # Coefficients of a combination below this share of its largest are rounding.
 _NAMED = 1e-3
-# Standard deviations of a delay, and residuals in units of the encoders' noise, that are told.
-_SURE, _MISFIT = 4.0, 2.0
+# Standard deviations of a delay, and of what fits better beyond a bound, that are told.
+_SURE = 4.0
 # Doubts about a log from which no value could be right.
 _NEVER = ("dead encoder", "clock of the log")
 
@@ -64,7 +65,7 @@ class Identification(Frozen):
         predicted: The positions at the samples of each log (K, n) by motions with the values, each over the horizon
             from a start of its own [rad or m].
         predicted_before: The same with the scene's own values, from the same starts.
-        residuals: Samples minus ``predicted`` (K, n); NaN where one is missing.
+        residuals: Samples minus ``predicted`` (K, n); NaN where one is missing, or Ctrl-C came before.
         held_out: The same for the logs that were held out.
         status: ``"converged"``, ``"evaluations"`` where they were too few, or ``"interrupted"``.
         warnings: What is doubtful, the worst first.
@@ -213,12 +214,20 @@ def _made(fit: Fit, y: Floats, runs: Sequence[Run], apart: Sequence[Run], status
     covariance, null = _covariance(fit, slopes)
     # Where the residuals are larger than the encoders' noise, the values are less certain by as much.
     covariance = covariance * max(1.0, fit.least / len(fit.jacobian))
-    predicted, before = [], []
-    for run in [*runs, *apart]:
-        stretches = run.settled(scene, late)
-        predicted.append(_positions(run, stretches, scene, late))
-        before.append(_positions(run, stretches, fit.of.scene, 0.0 if fit.delay is None else fit.delay))
-    residuals = tuple(run.log.q - own for run, own in zip([*runs, *apart], predicted, strict=True))
+    all_runs = [*runs, *apart]
+    predicted, before = ([np.full(run.log.q.shape, np.nan) for run in all_runs] for _ in range(2))
+    changes = beyond = np.zeros(P)
+    try:
+        for k, run in enumerate(all_runs):
+            stretches = run.settled(scene, late)
+            predicted[k] = _positions(run, stretches, scene, late)
+            before[k] = _positions(run, stretches, fit.of.scene, 0.0 if fit.delay is None else fit.delay)
+        if not fit.of.scene.processes:
+            changes, beyond = _step_error(fit, runs, y)
+    except KeyboardInterrupt:
+        # The values are known; what is left are their motions.
+        status = "interrupted"
+    residuals = tuple(run.log.q - own for run, own in zip(all_runs, predicted, strict=True))
     deviation = float(np.sqrt(covariance[P, P])) if fit.delay is None else 0.0
     known, of = len(runs), fit.of
     motions: dict[str, Any] = {"predicted": predicted[:known], "predicted_before": before[:known]}
@@ -228,8 +237,7 @@ def _made(fit: Fit, y: Floats, runs: Sequence[Run], apart: Sequence[Run], status
         delay_deviation=deviation, null_space=null, scene=scene, status=status,
         **{name: tuple(each) for name, each in motions.items()},
     )  # fmt: skip
-    changes = np.zeros(P) if fit.of.scene.processes else _step_error(fit, runs, y)
-    found = tuple(_doubts(fit, made, changes))
+    found = tuple(_doubts(fit, made, changes, beyond))
     announce(logger, fit.of.scene.announced, fit.dt, found)
     return made.changed(warnings=(*found, *(each for run in runs for each in run.log.warnings)))
 
@@ -291,8 +299,8 @@ def _sentences(null: Floats, names: Sequence[str]) -> list[str]:
     return found
 
 
-def _step_error(fit: Fit, runs: Sequence[Run], y: Floats) -> Floats:
-    """What half the step changes in the values (P,), to first order."""
+def _step_error(fit: Fit, runs: Sequence[Run], y: Floats) -> tuple[Floats, Floats]:
+    """What half the step, and no bounds, would change in the values (P,), to first order."""
     finer = copy(fit)
     finer.dt *= 0.5
     steps = []
@@ -301,11 +309,11 @@ def _step_error(fit: Fit, runs: Sequence[Run], y: Floats) -> Floats:
         r, J = simulations(each, [part for run in of for part in run.settled(scene, fit.late(y))], y)
         both, slopes = fit.with_prior(r, J, y)
         steps.append(np.linalg.lstsq(slopes, both, rcond=_NOTHING)[0])
-    change: Floats = fit.values(y)[1] @ (steps[0] - steps[1])
-    return change
+    slopes = fit.values(y)[1]
+    return slopes @ (steps[0] - steps[1]), -slopes @ steps[0]
 
 
-def _doubts(fit: Fit, made: Identification, changes: Floats) -> list[Finding]:
+def _doubts(fit: Fit, made: Identification, changes: Floats, beyond: Floats) -> list[Finding]:
     found = []
     if fit.least >= LOST**2:
         text = "motions with these values cannot be simulated: a column or its unit is wrong, or dt is too long"
@@ -315,11 +323,9 @@ def _doubts(fit: Fit, made: Identification, changes: Floats) -> list[Finding]:
     there = np.isfinite(together)
     by_joint = np.sqrt(np.where(there, together, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1))
     worst = int(np.argmax(by_joint))
-    over = np.sqrt(fit.least / len(fit.jacobian))
-    if fit.of.scene.processes and not over <= _MISFIT:
-        text = f"the innovations are {over:.3g} times what the scene's noise and q_noise explain: something else acts"
-        found.append(Finding("misfit", text, value=float(over)))
-    if not by_joint[worst] <= _MISFIT and not fit.of.scene.processes:
+    if fit.of.scene.processes:
+        found += misfit(float(np.sqrt(fit.least / len(fit.jacobian))))
+    elif not by_joint[worst] <= MISFIT:
         joint = fit.of.scene.robot.joint_names[worst]
         text = (
             f"the residuals of {joint!r} are {by_joint[worst]:.3g} times q_noise: something acts that is no "
@@ -335,6 +341,11 @@ def _doubts(fit: Fit, made: Identification, changes: Floats) -> list[Finding]:
             f"deviations: take a smaller dt{higher}"
         )
         found.append(Finding("step", text, value=float(changes[k]), unit=made.units[k]))
+    beyond = np.where(made.values <= fit.of.least, -beyond, 0.0)
+    k = int(np.argmax(beyond - _SURE * made.deviations))
+    if beyond[k] > _SURE * made.deviations[k]:
+        text = f"{made.names[k]} is at its least value, and {beyond[k]:.3g} {made.units[k]} less would fit better"
+        found.append(Finding("bound", f"{text}: something acts that is no parameter", value=float(beyond[k])))
     if made.status == "evaluations":
         found.append(Finding("evaluations", "the search ended at its most evaluations: evaluations= allows more"))
     if fit.delay is None and abs(made.delay) > max(_SURE * made.delay_deviation, 1e-2 * fit.dt):
