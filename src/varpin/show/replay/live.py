@@ -25,24 +25,13 @@ from varpin.errors import InputError
 from varpin.marks import Marks
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot
-from varpin.show.given import frame_names
 from varpin.show.replay import shapes
-from varpin.show.replay.drawing import Actor, Stage, draw, joint_motion, mark_name, mark_node, set_view, tree_positions
-from varpin.show.replay.marks import (
-    KINDS,
-    LABEL,
-    TUBE,
-    Figure,
-    Mark,
-    references,
-    require_marks,
-    rod,
-    rows_at,
-    surroundings,
-    translation,
-)
+from varpin.show.replay.drawing import Drawing, item_node, joint_motion, set_view, tree_positions
+from varpin.show.replay.figure import Shown, require_marks, rows_at
+from varpin.show.replay.marks import KINDS, LABEL, TUBE, rod
 from varpin.show.replay.page import open_browser
 from varpin.show.replay.picture import label
+from varpin.show.replay.stage import Stage
 from varpin.support.checks import flag, positive
 from varpin.trajectory import Nodes
 
@@ -122,14 +111,8 @@ class LiveView:
         lower, upper = robot.position_limits
         start = np.clip(np.zeros(robot.dof), lower, upper)
         self._q = np.asarray(getattr(source, "q0", start), dtype=np.float64)
-        self._path: dict[str, list[Floats]] = {name: [] for name in frame_names("trace", [robot], marks.trace)[0]}
-        (frames,) = frame_names("frames", [robot], marks.frames)
-
-        def annotate(figure: Figure) -> Iterator[Mark]:
-            yield from references(figure, marks.reference)
-            yield from surroundings(figure, marks, frames, source, np.zeros(1), 0.0)
-
-        self._stage = Stage.of(np.zeros(1), [Actor(robot, {"robot": self._q[None]}, annotate)])
+        self._stage = Stage.of([Shown(robot, source, marks, np.zeros(1), self._q[None])])
+        self._path: dict[str, list[Floats]] = {name: [] for name in self._stage.figures[0].trace}
         open = flag("open", open)
         self._text, self._text_time = "", -math.inf
         self._closed = False
@@ -137,7 +120,7 @@ class LiveView:
         self._window = _Window()
         self.url: str = self._window.web_url
         self._viewer = meshcat.Visualizer(window=self._window)
-        draw(self._viewer, self._stage)
+        Drawing(self._viewer, self._stage).draw()
         self._nodes = self._stage.figures[0].picture.moving_nodes("robot")
         self._in_view = self._stage.points
         self._begin_run()
@@ -266,10 +249,10 @@ class LiveView:
             if positions[j] != before[j] or self._shown == -math.inf:
                 self._viewer[node].set_transform(joint_motion(bool(tree.prismatic[j]), positions[j]))
         self._q = row[0]
-        figure = replace(self._stage.figures[0], q=row)
+        figure = replace(self._stage.figures[0], rows={"robot": row})
         for k, mark in enumerate(self._stage.marks[0]):
             for item in [] if mark.tied is None else rod(figure, mark.tied):
-                self._viewer[mark_node(figure.picture, mark_name(k, mark), item.node)].set_transform(item.pose)
+                self._viewer[item_node(figure, k, mark, item)].set_transform(item.pose)
         self._keep_in_view(figure.poses[1][0])
 
     def _keep_in_view(self, points: Floats) -> None:
@@ -301,7 +284,7 @@ class LiveView:
         if words == self._text or (now - self._text_time < _TEXT_INTERVAL and not last):
             return
         low, high = self._in_view.min(axis=0), self._in_view.max(axis=0)
-        self._viewer["notes/words"].set_transform(translation(np.array([*(0.5 * (low + high))[:2], low[2]])))
+        self._viewer["notes/words"].set_transform(shapes.transform(np.array([*(0.5 * (low + high))[:2], low[2]])))
         self._viewer["notes/words"].set_object(shapes.Label(words, LABEL * self._stage.size, 0.0))
         self._text, self._text_time = words, now
 

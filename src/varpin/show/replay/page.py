@@ -19,10 +19,10 @@ import numpy as np
 import umsgpack
 
 from varpin.errors import InputError
-from varpin.io.archive import atomic_file
-from varpin.show.replay.drawing import EFFORT_COLORS, Stage, draw
-from varpin.show.replay.marks import legend
+from varpin.show.replay.drawing import EFFORT_COLORS, Drawing
+from varpin.show.replay.marks import KINDS
 from varpin.show.replay.shapes import GHOST_COLOR
+from varpin.show.replay.stage import Stage
 
 logger = logging.getLogger(__name__)
 
@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 _SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 
 
-class Page:
+class _Recorder:
     """Replaces meshcat's window and keeps the commands that a window would send to its server."""
 
     def __init__(self) -> None:
@@ -44,13 +44,16 @@ class Page:
         except OverflowError:
             raise InputError("the replay has sizes or positions beyond 3e38, which no viewer draws") from None
 
-    def html(self, stage: Stage) -> str:
-        """The page: meshcat's viewer, the compressed commands, the legend and the control bar."""
-        viewer = Path(meshcat.viewer_assets_path(), "dist", "main.min.js").read_text(encoding="utf-8")
-        stream = b"".join(len(command).to_bytes(4, "little") + command for command in self.commands)
-        packed = base64.b64encode(gzip.compress(stream, 6, mtime=0)).decode()
-        title, key = markup.escape(stage.title), "\n".join(_legend(stage))
-        return f"""<!DOCTYPE html>
+
+def page_of(stage: Stage) -> str:
+    """A stage as one HTML file: meshcat's viewer, the compressed commands, the legend and the control bar."""
+    window = _Recorder()
+    Drawing(meshcat.Visualizer(window=window), stage).draw()
+    viewer = Path(meshcat.viewer_assets_path(), "dist", "main.min.js").read_text(encoding="utf-8")
+    stream = b"".join(len(command).to_bytes(4, "little") + command for command in window.commands)
+    packed = base64.b64encode(gzip.compress(stream, 6, mtime=0)).decode()
+    title, key = markup.escape(stage.title), "\n".join(_legend(stage))
+    return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
@@ -75,22 +78,25 @@ def _part(name: str) -> str:
 
 
 def _legend(stage: Stage) -> Iterator[str]:
-    """The lines of the legend, one for each kind of mark, and the error of the motion."""
+    """The lines of the legend, one for each kind of mark, and the note."""
     marks = [mark for own in stage.marks for mark in own]
     lines: list[tuple[str, list[int]]] = []
-    if any(actor.effort is not None for actor in stage.actors):
+    if any(figure.effort is not None for figure in stage.figures):
         scale = [int.from_bytes(np.rint(255.0 * color).astype(np.uint8).tobytes()) for color in EFFORT_COLORS]
         lines.append(("torque: none, half, all of the limit", scale))
-    if any("ghost" in actor.motions for actor in stage.actors):
+    if any("ghost" in figure.rows for figure in stage.figures):
         planned = any(mark.kind == "plan" for mark in marks)
-        lines.append(("plan" if planned else "ghost", [GHOST_COLOR]))
-    lines += [(text, [color]) for text, color in legend(marks)]
+        lines.append(("plan" if planned else "ghost", [GHOST_COLOR] * 2))
+    for kind, (words, color) in KINDS.items():
+        if names := ", ".join(dict.fromkeys(mark.name for mark in marks if mark.kind == kind)):
+            text = words.format(names)
+            lines.append((kind if text == f"{kind}: {kind}" else text, [color] * 2))
     for text, colors in lines:
-        ramp = ", ".join(f"#{color:06x}" for color in (colors if len(colors) > 1 else colors * 2))
+        ramp = ", ".join(f"#{color:06x}" for color in colors)
         swatch = f'<span class="swatch" style="background: linear-gradient(to right, {ramp})"></span>'
         yield f"<li>{swatch}{markup.escape(text)}</li>"
-    if stage.error:
-        yield f"<li>{markup.escape(stage.error)}</li>"
+    if stage.note:
+        yield f"<li>{markup.escape(stage.note)}</li>"
 
 
 def _bar(stage: Stage) -> str:
@@ -128,29 +134,11 @@ class Inline:
         )
 
 
-def write_page(path: Path, stage: Stage) -> Path:
-    """Write a stage as one self-contained HTML file."""
-    with atomic_file(path) as stream:
-        stream.write(_page(stage).encode())
-    return path
-
-
-def inline_page(stage: Stage, size: tuple[int, int]) -> Inline:
-    """A stage's page for a notebook, with a width and a height [pixels]."""
-    return Inline(_page(stage), stage.title, size)
-
-
-def _page(stage: Stage) -> str:
-    page = Page()
-    draw(meshcat.Visualizer(window=page), stage)
-    return page.html(stage)
-
-
 def open_viewer(stage: Stage) -> meshcat.Visualizer:
     """Draw a stage in a new meshcat server, and open it in a web browser."""
     with contextlib.redirect_stdout(io.StringIO()):
         viewer = meshcat.Visualizer()
-    draw(viewer, stage)
+    Drawing(viewer, stage).draw()
     open_browser(viewer.url())
     return viewer
 

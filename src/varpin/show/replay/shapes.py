@@ -6,7 +6,8 @@ import base64
 import html as markup
 import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -39,6 +40,18 @@ _GHOST: dict[str, Any] = {
     "polygonOffset": True,
     "polygonOffsetFactor": 2.0,
     "polygonOffsetUnits": 64.0,
+}
+_CLEAR: dict[str, Any] = {"transparent": True, "depthWrite": False}
+# Materials of marks.
+LOOKS: Mapping[str, Callable[..., MeshBasicMaterial | MeshPhongMaterial]] = {
+    "flat": MeshBasicMaterial,
+    # Does not hide a frame that reaches it.
+    "soft": partial(MeshPhongMaterial, opacity=0.6, transparent=True),
+    # Is visible through the links around it.
+    "through": partial(MeshBasicMaterial, opacity=0.85, depthTest=False, **_CLEAR),
+    # Hide nothing behind them.
+    "sheet": partial(MeshBasicMaterial, opacity=0.25, **_CLEAR),
+    "solid": partial(MeshPhongMaterial, opacity=0.4, flatShading=True, **_CLEAR),
 }
 _SIDES = 6
 # Indices of a tube's corners that draw one of its pieces.
@@ -133,6 +146,15 @@ def _picture(path: str | Path) -> Any:
     return meshcat.geometry.ImageTexture(meshcat.geometry.PngImage(Path(path).read_bytes()), wrap=[_REPEAT, _REPEAT])
 
 
+def transform(place: Floats, rotation: Floats | None = None) -> Floats:
+    """Transform (4, 4) of a translation, after a rotation."""
+    pose = np.eye(4)
+    pose[:3, 3] = place
+    if rotation is not None:
+        pose[:3, :3] = rotation
+    return pose
+
+
 def _hex(color: ArrayLike) -> int:
     red, green, blue = (round(255 * float(part)) for part in np.clip(np.asarray(color)[:3], 0.0, 1.0))
     return red << 16 | green << 8 | blue
@@ -141,47 +163,24 @@ def _hex(color: ArrayLike) -> int:
 def tube(points: Floats, radius: float, color: int) -> Object:
     """A tube along a path (P, 3), P > 1; WebGL draws lines one pixel wide, whatever width is set."""
     vertices, faces = _swept(points, radius)
-    return meshcat.geometry.Mesh(TriangularMeshGeometry(vertices, faces), MeshBasicMaterial(color=color))
+    return meshcat.geometry.Mesh(TriangularMeshGeometry(vertices, faces), LOOKS["flat"](color=color))
 
 
-def bead(radius: float, color: int) -> Object:
-    """A small solid sphere."""
-    return meshcat.geometry.Mesh(meshcat.geometry.Sphere(radius), MeshBasicMaterial(color=color))
-
-
-def ball(radius: float, color: int) -> Object:
-    """A translucent sphere, which does not hide a frame that reaches it."""
-    material = MeshPhongMaterial(color=color, opacity=0.6, transparent=True)
-    return meshcat.geometry.Mesh(meshcat.geometry.Sphere(radius), material)
-
-
-def joint_ball(radius: float, color: int) -> Object:
-    """A small sphere that is visible through the links around it."""
-    material = MeshBasicMaterial(color=color, opacity=0.85, transparent=True, depthTest=False, depthWrite=False)
-    return meshcat.geometry.Mesh(meshcat.geometry.Sphere(radius), material)
-
-
-def rod(radius: float, color: int) -> Object:
-    """A rod of length 1 around the z axis, from -1/2 to 1/2."""
-    return tube(np.array([[0.0, 0.0, -0.5], [0.0, 0.0, 0.5]]), radius, color)
+def sphere(radius: float, color: int, look: str) -> Object:
+    """A sphere with one of the looks of marks."""
+    return meshcat.geometry.Mesh(meshcat.geometry.Sphere(radius), LOOKS[look](color=color))
 
 
 def sheet(half: float, color: int) -> Object:
     """A translucent square normal to the z axis, of side 2 ``half`` [m], visible from both sides."""
     corners = half * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     form = TriangularMeshGeometry(corners, np.array([[0, 1, 2], [0, 2, 3]]))
-    return meshcat.geometry.Mesh(form, _glass(MeshBasicMaterial, color, 0.25))
+    return meshcat.geometry.Mesh(form, LOOKS["sheet"](color=color))
 
 
 def solid(form: Hull, color: int) -> Object:
     """A translucent convex hull."""
-    material = _glass(MeshPhongMaterial, color, 0.4, flatShading=True)
-    return meshcat.geometry.Mesh(TriangularMeshGeometry(form.points, form.faces), material)
-
-
-def _glass(kind: Any, color: int, opacity: float, **options: Any) -> Any:
-    """A translucent material that hides nothing behind it."""
-    return kind(color=color, opacity=opacity, transparent=True, depthWrite=False, **options)
+    return meshcat.geometry.Mesh(TriangularMeshGeometry(form.points, form.faces), LOOKS["solid"](color=color))
 
 
 def triad(length: float) -> Object:

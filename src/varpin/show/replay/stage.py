@@ -1,0 +1,122 @@
+"""Where robots and their marks stand in a replay, and from where they are seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from varpin.arrays import Floats
+from varpin.show.given import frame_names, motion_of
+from varpin.show.replay.figure import MOST_FRAMES, Figure, Shown, across, keyframe_times, rows_at, samples
+from varpin.show.replay.marks import REGIONS, Mark, marks_of
+from varpin.show.replay.picture import Picture
+from varpin.trajectory import Trajectory
+
+# Distance between robots side by side, relative to the widest of them.
+_GAP = 0.15
+# Part of a region that is shown around the rest, relative to the size of a robot's motion.
+_AROUND = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """The contents of a replay, in their places."""
+
+    # Times of the keyframes (K,) [s of playback]. All tracks share them: each track loops on its own, and tracks of
+    # unequal length would drift apart.
+    times: Floats
+    figures: Sequence[Figure]
+    marks: Sequence[Sequence[Mark]]  # of each figure
+    places: Sequence[Floats]  # position of the world of each (3,) [m]
+    points: Floats  # points around everything that is shown (P, 3) [m]
+    toward: Floats  # unit vector (3,) to the camera
+    size: float  # size of the largest robot's motion [m]
+    speed: float  # seconds of motion in a second of playback
+    note: str  # how far the picture may be off in words, for the legend; empty where nothing is known
+
+    @classmethod
+    def of(cls, shown: Sequence[Shown], speed: float = 1.0, fps: float = 1.0) -> Stage:
+        """The robots side by side with their marks, as a camera sees them that shows all."""
+        times = keyframe_times(shown, fps / speed)
+        robots = [one.robot for one in shown]
+        pictures = {id(robot): Picture.of(robot) for robot in robots}
+        rows = [{name: rows_at(times, *motion) for name, motion in one.motions.items()} for one in shown]
+        swept, axes = [], []
+        for robot, motions in zip(robots, rows, strict=True):
+            q = np.concatenate([*map(samples, motions.values())])
+            swept.append(pictures[id(robot)].swept(q))
+            axes.append(pictures[id(robot)].body_poses(q)[0][..., 2].reshape(-1, 3))
+        size = max(float(np.ptp(points, axis=0).max()) for points in swept) or 1.0
+        toward = view_direction(np.concatenate(axes))
+        figures = [
+            Figure(
+                one,
+                pictures[id(one.robot)],
+                number=f" {k + 1}" if k else "",
+                trace=frame_names("trace", robots, one.marks.trace)[k],
+                frames=frame_names("frames", robots, one.marks.frames)[k],
+                times=times,
+                rows=rows[k],
+                effort=one.effort(times),
+                swept=swept[k],
+                size=size,
+                toward=toward,
+            )
+            for k, one in enumerate(shown)
+        ]
+        marks = [list(marks_of(figure)) for figure in figures]
+        extents = [_extent(figure, own) for figure, own in zip(figures, marks, strict=True)]
+        places = side_by_side(extents, toward)
+        points = np.concatenate([points + place for points, place in zip(extents, places, strict=True)])
+        return cls(times / speed, figures, marks, places, points, toward, size, speed, _note(shown, times))
+
+    @property
+    def title(self) -> str:
+        """The names of the robots."""
+        return ", ".join(dict.fromkeys(figure.robot.name for figure in self.figures))
+
+
+def _note(shown: Sequence[Shown], times: Floats) -> str:
+    """How far the picture at the keyframes (K,) [s] may be off, in words."""
+    motions = [motion_of(one.given) for one in shown]
+    errors = [path.error_text for path in motions if isinstance(path, Trajectory) and path.error_text]
+    notes = [f"estimated {'; '.join(errors)} rad or m"] if errors else []
+    notes += [f"drawn every {times[1]:.2g} s, straight in between"] if len(times) == MOST_FRAMES else []
+    return "; ".join(notes)
+
+
+def _extent(figure: Figure, marks: Sequence[Mark]) -> Floats:
+    """Points (P, 3) around a robot and its marks [m]; regions much larger than the rest are shown in part."""
+    points = np.concatenate([figure.swept, *(mark.around for mark in marks if mark.kind not in REGIONS)])
+    low, high, margin = points.min(axis=0), points.max(axis=0), _AROUND * figure.size
+    regions = [mark.around for mark in marks if mark.kind in REGIONS]
+    return np.concatenate([points, *(np.clip(region, low - margin, high + margin) for region in regions)])
+
+
+def side_by_side(extents: Sequence[Floats], toward: Floats) -> list[Floats]:
+    """Translations (3,) that put figures, each of points (P, 3) [m], in a row as the camera sees them."""
+    right = across(toward)
+    spans = [((points @ right).min(), (points @ right).max()) for points in extents]
+    gap = _GAP * max(high - low for low, high in spans)
+    at, places = 0.0, [np.zeros(3)]
+    for (_, end), (begin, _) in pairwise(spans):
+        at += end - begin + gap
+        places.append(at * right)
+    return places
+
+
+def view_direction(joint_axes: Floats) -> Floats:
+    """Unit vector (3,) to the camera: across the plane of planar joint axes (k, 3), else from front and side."""
+    weights, directions = np.linalg.eigh(joint_axes.T @ joint_axes)
+    if weights[-1] > 0.98 * weights.sum():
+        normal = directions[:, -1]
+        if normal @ [0.1, -0.2, 1.0] < 0.0:
+            normal = -normal
+        side = [0.0, -0.75, 0.0] if normal[2] > 0.7 else [0.0, 0.0, 0.25]
+        toward = normal + side
+    else:
+        toward = np.array([1.0, -1.2, 0.6])
+    return np.asarray(toward / np.linalg.norm(toward))
