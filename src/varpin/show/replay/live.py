@@ -26,12 +26,12 @@ from varpin.marks import Marks
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot
 from varpin.show.replay import shapes
-from varpin.show.replay.drawing import Drawing, item_node, joint_motion, set_view, tree_positions
+from varpin.show.replay.drawing import draw, set_view
 from varpin.show.replay.figure import Shown, require_marks, rows_at
 from varpin.show.replay.marks import KINDS, LABEL, TUBE, rod
 from varpin.show.replay.page import open_browser
 from varpin.show.replay.picture import label
-from varpin.show.replay.stage import Stage
+from varpin.show.replay.stage import Stage, joint_items, mark_items
 from varpin.support.checks import flag, positive
 from varpin.trajectory import Nodes
 
@@ -120,8 +120,8 @@ class LiveView:
         self._window = _Window()
         self.url: str = self._window.web_url
         self._viewer = meshcat.Visualizer(window=self._window)
-        Drawing(self._viewer, self._stage).draw()
-        self._nodes = self._stage.figures[0].picture.moving_nodes("robot")
+        draw(self._viewer, self._stage)
+        self._poses: dict[str, bytes] = {}  # those of nodes that have moved
         self._in_view = self._stage.points
         self._begin_run()
         if open and open_browser(self.url):
@@ -242,17 +242,16 @@ class LiveView:
         self._shown, self._drawn = now, time.monotonic()
 
     def _pose(self, row: Floats) -> None:
-        """Update the joints that have moved, the rods between bodies and, if necessary, the camera, for q (1, n)."""
-        tree = self.robot.tree
-        before, (positions,) = tree_positions(self.robot, self._q[None])[0], tree_positions(self.robot, row)
-        for j, node in enumerate(self._nodes):
-            if positions[j] != before[j] or self._shown == -math.inf:
-                self._viewer[node].set_transform(joint_motion(bool(tree.prismatic[j]), positions[j]))
-        self._q = row[0]
-        figure = replace(self._stage.figures[0], rows={"robot": row})
+        """Update the joints and the rods that have moved and, if necessary, the camera, for q (1, n)."""
+        figure, self._q = replace(self._stage.figures[0], rows={"robot": row}), row[0]
+        items = [*joint_items(figure, "robot")]
         for k, mark in enumerate(self._stage.marks[0]):
-            for item in [] if mark.tied is None else rod(figure, mark.tied):
-                self._viewer[item_node(figure, k, mark, item)].set_transform(item.pose)
+            if mark.tied is not None:
+                items += mark_items(figure, k, replace(mark, items=[*rod(figure, mark.tied)]))
+        for item in items:
+            if self._poses.get(item.node) != (pose := item.pose.tobytes()):
+                self._viewer[item.node].set_transform(item.pose)
+                self._poses[item.node] = pose
         self._keep_in_view(figure.poses[1][0])
 
     def _keep_in_view(self, points: Floats) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import reprlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,8 +27,6 @@ from varpin.show.replay.picture import corners_of
 from varpin.support.checks import as_floats, require_finite
 
 if TYPE_CHECKING:
-    from meshcat.geometry import Object
-
     from varpin.control.constraints import PlanConstraint
 
 # Line of the legend and colour of each kind of mark. Robots and the background have none of these colours.
@@ -53,38 +51,13 @@ _BEADS = 12
 
 
 @dataclass(frozen=True, eq=False)
-class Item:
-    """An object of a page, or a node for several."""
-
-    node: str  # its path below the node of its mark
-    form: Object | None = None  # the object, if there is one
-    pose: Floats = field(default_factory=lambda: np.eye(4))  # transform (4, 4) in the frame of its body
-    body: int | None = None  # the body that carries it, -1 for the base; None for the world
-    tracks: Mapping[str, Floats] = field(default_factory=dict)  # values (K, ...) at the keyframes, by property
-
-    @classmethod
-    def moving(
-        cls, node: str, form: Object | None, places: Floats, turns: Floats | None = None, lengths: Floats | None = None
-    ) -> Item:
-        """An item in the world, at positions (1 or K, 3) with quaternions (x, y, z, w) and lengths along z, as many."""
-        pose, tracks = shapes.transform(places[0]), {"position": places}
-        if turns is not None:
-            pose[:3, :3] = pin.Quaternion(turns[0]).toRotationMatrix()
-            tracks["quaternion"] = turns
-        if lengths is not None:
-            pose[:3, 2] *= lengths[0]
-            tracks["scale"] = np.column_stack([np.ones((len(lengths), 2)), lengths])
-        return cls(node, form, pose, None, tracks if len(places) > 1 else {})
-
-
-@dataclass(frozen=True, eq=False)
 class Mark:
     """What is drawn beside a robot."""
 
     kind: str  # A key of ``KINDS``, for the legend, or another word
     name: str
     around: Floats  # points around it (P, 3) [m]
-    items: Sequence[Item]
+    items: Sequence[shapes.Item]
     tied: Constraint | None = None  # the constraint between two points whose rod moves with the robot
 
 
@@ -134,7 +107,7 @@ def _path(figure: Figure, kind: str, name: str, points: Floats, reached: Floats 
     # drawRange is the number of corners that three.js draws, so that a piece can be drawn in part.
     drawn = {} if reached is None else {"geometry[drawRange].count": shapes.TUBE_PIECE * reached}
     tube = shapes.tube(points, TUBE * figure.size, KINDS[kind][1])
-    return Mark(kind, name, points, [Item("", tube, tracks=drawn)])
+    return Mark(kind, name, points, [shapes.Item("", tube, tracks=drawn)])
 
 
 def _beads(figure: Figure) -> Iterator[Mark]:
@@ -148,7 +121,7 @@ def _beads(figure: Figure) -> Iterator[Mark]:
     for name in figure.trace:
         ways = [figure.robot.frame_positions(q, name) for q in plans]
         form = shapes.sphere(_BEAD * figure.size, shapes.GHOST_COLOR, "flat")
-        items = [Item.moving(str(b), form, way) for b, way in enumerate(ways)]
+        items = [shapes.Item.moving(str(b), form, way) for b, way in enumerate(ways)]
         yield Mark("plan", name, np.concatenate(ways), items)
 
 
@@ -195,11 +168,11 @@ def _target(figure: Figure, name: str, places: Floats, turns: Floats | None = No
     size, right = figure.size, across(figure.toward)
     up = np.cross(figure.toward, right)
     items = [
-        Item.moving("", None, places, turns),
-        Item("ball", shapes.sphere(_BALL * size, KINDS["target"][1], "soft")),
-        *([] if turns is None else [Item("axes", shapes.triad(_TRIAD * size))]),
+        shapes.Item.moving("", None, places, turns),
+        shapes.Item("ball", shapes.sphere(_BALL * size, KINDS["target"][1], "soft")),
+        *([] if turns is None else [shapes.Item("axes", shapes.triad(_TRIAD * size))]),
         # The tool comes to a target from above or from the side.
-        Item("label", shapes.Label(name, LABEL * size, -1.2 * _BALL * size)),
+        shapes.Item("label", shapes.Label(name, LABEL * size, -1.2 * _BALL * size)),
     ]
     half = 0.5 * shapes.label_width(name) * LABEL * size * right
     bottom = (1.2 * _BALL + LABEL) * size * up
@@ -233,7 +206,7 @@ def _frame(figure: Figure, name: str) -> Mark:
     body, rotation, place = place_of_frame(figure.robot.model, name, figure.robot.name)
     q, tips = samples(figure.q), place + _TRIAD * figure.size * rotation.T
     around = np.concatenate([place_on_body(figure.robot.tree, q if body >= 0 else q[:1], body, tip) for tip in tips])
-    item = Item("", shapes.triad(_TRIAD * figure.size), shapes.transform(place, rotation), body)
+    item = shapes.Item("", shapes.triad(_TRIAD * figure.size), shapes.transform(place, rotation), body)
     return Mark("frame", name, around, [item])
 
 
@@ -245,9 +218,9 @@ def _ties(figure: Figure, constraint: Constraint) -> Iterator[Mark]:
     (here, _, a), (there, turned, b) = (point_of(end, getattr(constraint, end), figure.robot) for end in "ab")
     axis = getattr(constraint, "normal", getattr(constraint, "direction", None))
     ball = shapes.sphere(_POINT * size, color, "through")
-    items = [Item("a", ball, shapes.transform(a), here)]
+    items = [shapes.Item("a", ball, shapes.transform(a), here)]
     if axis is None:
-        items += [Item("b", ball, shapes.transform(b), there), *rod(figure, constraint)]
+        items += [shapes.Item("b", ball, shapes.transform(b), there), *rod(figure, constraint)]
     else:
         seen = place_on_body(figure.robot.tree, figure.q, here, a)
         axes = z_to(turned @ np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis))
@@ -259,16 +232,16 @@ def _ties(figure: Figure, constraint: Constraint) -> Iterator[Mark]:
             flat = local[:, :2]
             middle = b + axes[:, :2] @ (0.5 * (flat.min(axis=0) + flat.max(axis=0)))
             half = 0.5 * float(np.ptp(flat, axis=0).max()) + _EDGE * size
-            items.append(Item("plane", shapes.sheet(half, color), shapes.transform(middle, axes), there))
+            items.append(shapes.Item("plane", shapes.sheet(half, color), shapes.transform(middle, axes), there))
         else:
             ends = [local[:, 2].min() - _EDGE * size, local[:, 2].max() + _EDGE * size]
             line = shapes.tube(b + np.outer(ends, axes[:, 2]), TUBE * size, color)
-            items.append(Item("line", line, body=there))
+            items.append(shapes.Item("line", line, body=there))
     fixed = np.array([place for body, place in ((here, a), (there, b)) if body < 0]).reshape(-1, 3)
     yield Mark("constraint", name, fixed, items, constraint if axis is None else None)
 
 
-def rod(figure: Figure, constraint: Constraint) -> Iterator[Item]:
+def rod(figure: Figure, constraint: Constraint) -> Iterator[shapes.Item]:
     """The rod between the two points of a constraint; none if they always coincide."""
     ends = (point_of(end, getattr(constraint, end), figure.robot) for end in "ab")
     a, b = (place_on_body(figure.robot.tree, figure.q, body, place) for body, _, place in ends)
@@ -284,7 +257,7 @@ def rod(figure: Figure, constraint: Constraint) -> Iterator[Item]:
             before = span / length
         turns.append(turn.coeffs().copy())
     form = shapes.tube(np.array([[0.0, 0.0, -0.5], [0.0, 0.0, 0.5]]), _ROD * figure.size, KINDS["constraint"][1])
-    yield Item.moving("rod", form, 0.5 * (a + b), np.array(turns), lengths)
+    yield shapes.Item.moving("rod", form, 0.5 * (a + b), np.array(turns), lengths)
 
 
 def _regions(figure: Figure, constraints: Sequence[PlanConstraint], begin: float) -> Iterator[Mark]:
@@ -321,7 +294,7 @@ def _solid(kind: str, name: str, points: Floats, radius: float, places: Floats) 
     corners = (points[:, None] + radius * shapes.DIRECTIONS).reshape(-1, 3) if radius else points
     form = shapes.solid(hull_around(name, corners), KINDS[kind][1])
     around = np.concatenate([corners + places.min(axis=0), corners + places.max(axis=0)])
-    return Mark(kind, name, around, [Item.moving("", form, places)])
+    return Mark(kind, name, around, [shapes.Item.moving("", form, places)])
 
 
 def _open_box(figure: Figure, name: str, limits: Floats, place: Floats, axes: Floats) -> Mark:
@@ -335,7 +308,7 @@ def _open_box(figure: Figure, name: str, limits: Floats, place: Floats, axes: Fl
         return _solid("in", name, corners, 0.0, place[None])
     form = shapes.sheet(0.5 * float((high - low).max()), KINDS["in"][1])
     pose = shapes.transform(place + axes @ (0.5 * (low + high)), axes)
-    return Mark("in", name, place + corners, [Item("", form, pose)])
+    return Mark("in", name, place + corners, [shapes.Item("", form, pose)])
 
 
 def _goals(constraints: Sequence[PlanConstraint]) -> list[tuple[str, Floats]]:

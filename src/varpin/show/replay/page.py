@@ -19,10 +19,10 @@ import numpy as np
 import umsgpack
 
 from varpin.errors import InputError
-from varpin.show.replay.drawing import EFFORT_COLORS, Drawing
+from varpin.show.replay.drawing import draw
 from varpin.show.replay.marks import KINDS
 from varpin.show.replay.shapes import GHOST_COLOR
-from varpin.show.replay.stage import Stage
+from varpin.show.replay.stage import EFFORT_COLORS, Stage
 
 logger = logging.getLogger(__name__)
 
@@ -48,7 +48,7 @@ class _Recorder:
 def page_of(stage: Stage) -> str:
     """A stage as one HTML file: meshcat's viewer, the compressed commands, the legend and the control bar."""
     window = _Recorder()
-    Drawing(meshcat.Visualizer(window=window), stage).draw()
+    draw(meshcat.Visualizer(window=window), stage)
     viewer = Path(meshcat.viewer_assets_path(), "dist", "main.min.js").read_text(encoding="utf-8")
     stream = b"".join(len(command).to_bytes(4, "little") + command for command in window.commands)
     packed = base64.b64encode(gzip.compress(stream, 6, mtime=0)).decode()
@@ -138,7 +138,7 @@ def open_viewer(stage: Stage) -> meshcat.Visualizer:
     """Draw a stage in a new meshcat server, and open it in a web browser."""
     with contextlib.redirect_stdout(io.StringIO()):
         viewer = meshcat.Visualizer()
-    Drawing(viewer, stage).draw()
+    draw(viewer, stage)
     open_browser(viewer.url())
     return viewer
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.model import Robot, readable_geometry
@@ -22,43 +24,45 @@ logger = logging.getLogger(__name__)
 _ROD, _JOINT, _CENTER = (0.45, 0.52, 0.6, 1.0), (0.85, 0.45, 0.15, 1.0), (0.15, 0.35, 0.65, 1.0)
 
 
+class Shape(NamedTuple):
+    """A shape of a robot."""
+
+    form: pin.GeometryObject  # of its visual geometry, or of a skeleton; on a joint of ``robot.model``
+    parts: tuple[MeshPart, ...]  # of its mesh; none for a shape of another kind
+    body: int  # the body that carries it, -1 for the base
+    placement: pin.SE3  # its placement in the body's frame
+
+
 @dataclass(frozen=True)
 class Picture:
-    """The shapes to draw, by body; body -1 is the base.
-
-    The motion of a body's node is one number: the rotation about, or the translation along, the z axis of the joint.
-    """
+    """The shapes of a robot, on bodies whose joint axis is z."""
 
     robot: Robot
-    shapes: Sequence[pin.GeometryObject]  # its visual geometry, or a skeleton; on joints of ``robot.model``
-    meshes: Sequence[tuple[MeshPart, ...]]  # parts of the mesh of each shape; none for a shape of another kind
-    bodies: Sequence[int]  # body of each shape, -1 for the base
-    placements: Sequence[pin.SE3]  # placement of each shape in its body's frame
+    shapes: Sequence[Shape]
 
     @classmethod
     def of(cls, robot: Robot) -> Picture:
         """The picture of a robot from the meshes that can be read."""
         read = functools.cache(read_mesh)
         visuals, missing = readable_geometry(robot, read)
-        shapes = list(visuals.geometryObjects)
+        forms = list(visuals.geometryObjects)
         problem = "; ".join(dict.fromkeys(error for _, error in missing.values()))
-        problem = problem or f"robot {robot.name!r} comes without visual geometry"
-        if not shapes:
+        if not forms:
+            problem = problem or f"robot {robot.name!r} comes without visual geometry"
             logger.warning("%s; drawing a skeleton of its joints and centres of mass instead", problem)
-            shapes = _skeleton(robot)
+            forms = list(_skeleton(robot))
         elif missing:
-            links = ", ".join(map(repr, missing))
-            logger.warning("%s; drawing the skeleton of %s instead", problem, links)
+            logger.warning("%s; drawing the skeleton of %s instead", problem, ", ".join(map(repr, missing)))
             bare = {joint for joint, _ in missing.values()}
-            shapes += [shape for shape in _skeleton(robot) if shape.parentJoint in bare]
-        turns = _turns(robot)
-        return cls(
-            robot,
-            shapes,
-            [parts_of(shape, read) for shape in shapes],
-            [shape.parentJoint - 1 for shape in shapes],
-            [turns[shape.parentJoint] * shape.placement for shape in shapes],
-        )
+            forms += [form for form in _skeleton(robot) if form.parentJoint in bare]
+        # From the frames of the model's joints, the universe first, to those of the bodies.
+        axes = [joint_axis(robot.model, joint)[1] for joint in range(1, robot.model.njoints)]
+        turns = [pin.SE3.Identity(), *(pin.SE3(z_to(axis).T, np.zeros(3)) for axis in axes)]
+        shapes = [
+            Shape(form, parts_of(form, read), form.parentJoint - 1, turns[form.parentJoint] * form.placement)
+            for form in forms
+        ]
+        return cls(robot, shapes)
 
     def moving_nodes(self, root: str) -> list[str]:
         """Scene path below ``root`` of each body (b,)."""
@@ -77,10 +81,10 @@ class Picture:
     def corners(self, body: int) -> Floats:
         """Corners (k, 3) of the boxes around the shapes on a body, in its frame [m]."""
         boxes = [np.empty((0, 3))]
-        for shape, on, placement in zip(self.shapes, self.bodies, self.placements, strict=True):
+        for form, _, on, placement in self.shapes:
             if on == body:
-                shape.geometry.computeLocalAABB()
-                box = np.array([shape.geometry.aabb_local.min_, shape.geometry.aabb_local.max_])
+                form.geometry.computeLocalAABB()
+                box = np.array([form.geometry.aabb_local.min_, form.geometry.aabb_local.max_])
                 boxes.append(corners_of(box) @ placement.rotation.T + placement.translation)
         return np.concatenate(boxes)
 
@@ -96,13 +100,6 @@ class Picture:
 def corners_of(box: Floats) -> Floats:
     """The corners (8, 3) of a box (2, 3)."""
     return np.stack(np.meshgrid(*box.T), axis=-1).reshape(8, 3)
-
-
-def _turns(robot: Robot) -> list[pin.SE3]:
-    """Rotations from the model's joint frames, the universe first, to those of the bodies, whose joint axis is z."""
-    model = robot.model
-    axes = [joint_axis(model, joint)[1] for joint in range(1, model.njoints)]
-    return [pin.SE3.Identity(), *(pin.SE3(z_to(axis).T, np.zeros(3)) for axis in axes)]
 
 
 def label(name: str) -> str:
@@ -125,40 +122,36 @@ def labels(names: Iterable[str]) -> list[str]:
     return list(found)[len(_TAKEN) :]
 
 
-def _skeleton(robot: Robot) -> list[pin.GeometryObject]:
+def _skeleton(robot: Robot) -> Iterator[pin.GeometryObject]:
     """Spheres at joints and centres of mass, and rods from each joint to its children, frames and centre of mass."""
     model = robot.model
-    joints = range(1, model.njoints)
-    ends: dict[int, list[Floats]] = {joint: [] for joint in range(model.njoints)}
-    for joint in joints:
-        ends[model.parents[joint]].append(model.jointPlacements[joint].translation)
+    ends: list[list[Floats]] = [[] for _ in range(model.njoints)]
+    reach = np.zeros(model.njoints)
+    for joint, parent in enumerate(model.parents[1:], start=1):
+        place = model.jointPlacements[joint].translation
+        ends[parent].append(place)
+        reach[joint] = reach[parent] + np.linalg.norm(place)
     for frame in model.frames:
         if frame.type in (pin.FrameType.BODY, pin.FrameType.OP_FRAME):
             ends[frame.parentJoint].append(frame.placement.translation)
-    centers = {joint: model.inertias[joint].lever for joint in joints if model.inertias[joint].mass > 0.0}
-    reach = {0: 0.0}
-    for joint in joints:
-        reach[joint] = reach[model.parents[joint]] + float(np.linalg.norm(model.jointPlacements[joint].translation))
-    points = [(joint, point) for joint in ends for point in [*ends[joint], centers.get(joint, np.zeros(3))]]
-    size = max(reach[joint] + float(np.linalg.norm(point)) for joint, point in points) or 1.0
-    radius = 0.015 * size
+    centers = {j: body.lever for j, body in enumerate(model.inertias) if j and body.mass > 0.0}
+    for joint, center in centers.items():
+        ends[joint].append(center)
+    far = [max([0.0, *(float(np.linalg.norm(point)) for point in own)]) for own in ends]
+    size = float(max(reach + far)) or 1.0
+    radius, names = 0.015 * size, itertools.count()
 
-    shapes: list[pin.GeometryObject] = []
-
-    def add(joint: int, placement: pin.SE3, form: Any, color: tuple[float, ...]) -> None:
-        shape = pin.GeometryObject(f"skeleton{len(shapes)}", joint, placement, form)
+    def bone(joint: int, form: Any, color: ArrayLike, place: Floats, rotation: Floats) -> pin.GeometryObject:
+        shape = pin.GeometryObject(f"skeleton{next(names)}", joint, pin.SE3(rotation, place), form)
         shape.meshColor = np.array(color)
-        shapes.append(shape)
+        return shape
 
-    for joint in range(model.njoints):
+    for joint, own in enumerate(ends):
         if joint:
-            add(joint, pin.SE3.Identity(), pin.coal.Sphere(2.0 * radius), _JOINT)
-        center = centers.get(joint)
-        for point in [*ends[joint], *([] if center is None else [center])]:
+            yield bone(joint, pin.coal.Sphere(2.0 * radius), _JOINT, np.zeros(3), np.eye(3))
+        for point in own:
             length = float(np.linalg.norm(point))
             if length > radius:
-                placement = pin.SE3(z_to(point / length), 0.5 * point)
-                add(joint, placement, pin.coal.Cylinder(radius, length), _ROD)
-        if center is not None:
-            add(joint, pin.SE3(np.eye(3), center), pin.coal.Sphere(1.5 * radius), _CENTER)
-    return shapes
+                yield bone(joint, pin.coal.Cylinder(radius, length), _ROD, 0.5 * point, z_to(point / length))
+        if joint in centers:
+            yield bone(joint, pin.coal.Sphere(1.5 * radius), _CENTER, centers[joint], np.eye(3))

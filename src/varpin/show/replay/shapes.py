@@ -6,15 +6,16 @@ import base64
 import html as markup
 import logging
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 import meshcat
 import numpy as np
 import pinocchio as pin
-from meshcat.geometry import Geometry, MeshBasicMaterial, MeshPhongMaterial, Object, TriangularMeshGeometry
+from meshcat.geometry import Geometry, Mesh, MeshBasicMaterial, MeshPhongMaterial, Object, TriangularMeshGeometry
 from numpy.typing import ArrayLike, NDArray
 from pinocchio.visualize.meshcat_visualizer import MeshcatVisualizer
 
@@ -22,8 +23,7 @@ from varpin.arrays import Floats
 from varpin.model.hull import Hull
 from varpin.model.meshes import MeshPart, joined
 from varpin.model.tree import z_to
-
-Style: TypeAlias = Literal["own", "plain", "ghost"]
+from varpin.show.replay.picture import Shape
 
 logger = logging.getLogger(__name__)
 
@@ -64,33 +64,49 @@ DIRECTIONS = np.stack([np.cos(_RISE) * np.cos(_TURN), np.cos(_RISE) * np.sin(_TU
 )
 
 
-def load_shape(
-    viewer: meshcat.Visualizer,
-    shape: pin.GeometryObject,
-    parts: Sequence[MeshPart],
-    placement: pin.SE3,
-    node: str,
-    style: Style,
-) -> None:
-    """Send a shape, with the parts of its mesh if it is one, and its placement in the parent node.
+@dataclass(frozen=True, eq=False)
+class Item:
+    """A node of a page, with an object or for several."""
 
-    In its own colours, part by part; plain, as one object in one colour that can be animated; or as the ghost's.
-    """
-    if style == "own" and parts:
-        for k, part in enumerate(parts):
-            viewer[node if len(parts) == 1 else f"{node}/{k}"].set_object(_Triangles(part), _material(shape, part))
-    else:
-        if style == "ghost":
-            look = _GHOST | {"flatShading": bool(parts)}
-        else:
-            look = {"color": _hex(shape.meshColor), "opacity": float(shape.meshColor[3]), "flatShading": bool(parts)}
-        if style == "own" and shape.meshTexturePath:
-            look |= {"color": _hex(_WHITE), "map": _picture(shape.meshTexturePath)}
-        form = _Triangles(joined(parts)) if parts else _primitive(shape)
-        if form is None:
-            return
-        viewer[node].set_object(form, MeshPhongMaterial(**look))
-    viewer[node].set_transform(placement.homogeneous)
+    node: str  # its path, or that below the node of its mark
+    form: Object | None = None  # the object, if there is one
+    pose: Floats = field(default_factory=lambda: np.eye(4))  # transform (4, 4) in the frame of its body
+    body: int | None = None  # of a mark: the body that carries it, -1 for the base; None for the world
+    tracks: Mapping[str, Floats] = field(default_factory=dict)  # values (K, ...) at the keyframes, by property
+
+    @classmethod
+    def moving(
+        cls, node: str, form: Object | None, places: Floats, turns: Floats | None = None, lengths: Floats | None = None
+    ) -> Item:
+        """An item in the world, at positions (1 or K, 3) with quaternions (x, y, z, w) and lengths along z, as many."""
+        pose, tracks = transform(places[0]), {"position": places}
+        if turns is not None:
+            pose[:3, :3] = pin.Quaternion(turns[0]).toRotationMatrix()
+            tracks["quaternion"] = turns
+        if lengths is not None:
+            pose[:3, 2] *= lengths[0]
+            tracks["scale"] = np.column_stack([np.ones((len(lengths), 2)), lengths])
+        return cls(node, form, pose, None, tracks if len(places) > 1 else {})
+
+
+def shape_items(node: str, shape: Shape, *, ghost: bool = False, colors: Floats | None = None) -> Iterator[Item]:
+    """A shape of a robot: in its own looks, part by part; or in one piece, as the ghost's or in colours (K, 3)."""
+    own, parts, pose = shape.form, shape.parts, shape.placement.homogeneous
+    if parts and not ghost and colors is None:
+        forms = [Mesh(_Triangles(part), _material(own, part)) for part in parts]
+        yield Item(node, forms[0] if len(forms) == 1 else None, pose)
+        if len(forms) > 1:
+            yield from (Item(f"{node}/{k}", form) for k, form in enumerate(forms))
+        return
+    form = _Triangles(joined(parts)) if parts else _primitive(own)
+    if form is None:
+        return
+    color, opacity = own.meshColor if colors is None else colors[0], float(own.meshColor[3])
+    look: dict[str, Any] = _GHOST if ghost else {"color": _hex(color), "opacity": opacity}
+    if own.meshTexturePath and not ghost and colors is None:
+        look |= {"color": _hex(_WHITE), "map": _picture(own.meshTexturePath)}
+    tracks = {} if colors is None else {"material.color": colors}
+    yield Item(node, Mesh(form, MeshPhongMaterial(**look, flatShading=bool(parts))), pose, tracks=tracks)
 
 
 def _material(shape: pin.GeometryObject, part: MeshPart) -> MeshPhongMaterial:
@@ -163,24 +179,24 @@ def _hex(color: ArrayLike) -> int:
 def tube(points: Floats, radius: float, color: int) -> Object:
     """A tube along a path (P, 3), P > 1; WebGL draws lines one pixel wide, whatever width is set."""
     vertices, faces = _swept(points, radius)
-    return meshcat.geometry.Mesh(TriangularMeshGeometry(vertices, faces), LOOKS["flat"](color=color))
+    return Mesh(TriangularMeshGeometry(vertices, faces), LOOKS["flat"](color=color))
 
 
 def sphere(radius: float, color: int, look: str) -> Object:
     """A sphere with one of the looks of marks."""
-    return meshcat.geometry.Mesh(meshcat.geometry.Sphere(radius), LOOKS[look](color=color))
+    return Mesh(meshcat.geometry.Sphere(radius), LOOKS[look](color=color))
 
 
 def sheet(half: float, color: int) -> Object:
     """A translucent square normal to the z axis, of side 2 ``half`` [m], visible from both sides."""
     corners = half * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     form = TriangularMeshGeometry(corners, np.array([[0, 1, 2], [0, 2, 3]]))
-    return meshcat.geometry.Mesh(form, LOOKS["sheet"](color=color))
+    return Mesh(form, LOOKS["sheet"](color=color))
 
 
 def solid(form: Hull, color: int) -> Object:
     """A translucent convex hull."""
-    return meshcat.geometry.Mesh(TriangularMeshGeometry(form.points, form.faces), LOOKS["solid"](color=color))
+    return Mesh(TriangularMeshGeometry(form.points, form.faces), LOOKS["solid"](color=color))
 
 
 def triad(length: float) -> Object:
@@ -190,7 +206,7 @@ def triad(length: float) -> Object:
     faces = np.concatenate([triangles + k * len(corners) for k, (corners, triangles) in enumerate(parts)])
     colors = np.repeat(_AXES, len(parts[0][0]), axis=0)
     geometry = TriangularMeshGeometry(vertices, faces, color=colors)
-    return meshcat.geometry.Mesh(geometry, MeshBasicMaterial(vertexColors=True))
+    return Mesh(geometry, MeshBasicMaterial(vertexColors=True))
 
 
 def label_width(text: str) -> float:

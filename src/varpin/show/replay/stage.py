@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,9 +13,12 @@ from varpin.arrays import Floats
 from varpin.show.given import frame_names, motion_of
 from varpin.show.replay.figure import MOST_FRAMES, Figure, Shown, across, keyframe_times, rows_at, samples
 from varpin.show.replay.marks import REGIONS, Mark, marks_of
-from varpin.show.replay.picture import Picture
+from varpin.show.replay.picture import Picture, label
+from varpin.show.replay.shapes import Item, shape_items, transform
 from varpin.trajectory import Trajectory
 
+# Colours of no torque, half of the limit and the whole limit; linear in between.
+EFFORT_COLORS = np.array([[0.72, 0.76, 0.8], [0.98, 0.75, 0.1], [0.8, 0.05, 0.05]])
 # Distance between robots side by side, relative to the widest of them.
 _GAP = 0.15
 # Part of a region that is shown around the rest, relative to the size of a robot's motion.
@@ -73,10 +77,58 @@ class Stage:
         points = np.concatenate([points + place for points, place in zip(extents, places, strict=True)])
         return cls(times / speed, figures, marks, places, points, toward, size, speed, _note(shown, times))
 
+    def items(self) -> Iterator[Item]:
+        """Everything that is drawn."""
+        for figure, place, marks in zip(self.figures, self.places, self.marks, strict=True):
+            for kind in (*figure.rows, "notes"):
+                yield Item(f"{kind}{figure.number}", pose=transform(place))
+            for kind in figure.rows:
+                yield from joint_items(figure, kind)
+                yield from _shape_items(figure, kind)
+            for k, mark in enumerate(marks):
+                yield from mark_items(figure, k, mark)
+
     @property
     def title(self) -> str:
         """The names of the robots."""
         return ", ".join(dict.fromkeys(figure.robot.name for figure in self.figures))
+
+
+def joint_items(figure: Figure, kind: str) -> Iterator[Item]:
+    """The nodes of the joints of the "robot" or the "ghost", each below that of its parent."""
+    tree, q = figure.robot.tree, figure.rows[kind]
+    # Positions of all joints of the tree, mimic joints included.
+    positions = q[:, tree.coordinate] * tree.ratio + tree.offset
+    for j, slides in enumerate(tree.prismatic):
+        node, (c, s) = figure.node(kind, j), (math.cos(positions[0, j]), math.sin(positions[0, j]))
+        yield Item(node.removesuffix("/moving"), pose=transform(tree.translation[j], tree.rotation[j]))
+        if slides:
+            pose = transform(np.array([0.0, 0.0, positions[0, j]]))
+        else:
+            pose = transform(np.zeros(3), np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
+        # One number, so that the page interpolates in q and links stay rigid at any frame rate.
+        yield Item(node, pose=pose, tracks={"position[z]" if slides else "rotation[z]": positions[:, j]})
+
+
+def _shape_items(figure: Figure, kind: str) -> Iterator[Item]:
+    """The shapes of the "robot" or the "ghost", which has none on the base."""
+    ghost = kind == "ghost"
+    for k, shape in enumerate(figure.picture.shapes):
+        if ghost and shape.body < 0:
+            continue
+        node, colors = f"{figure.node(kind, shape.body)}/shapes/{k} {label(shape.form.name)}", None
+        if figure.effort is not None and shape.body >= 0 and not ghost:
+            shares, stops = figure.effort[:, shape.body], np.linspace(0.0, 1.0, len(EFFORT_COLORS))
+            colors = np.column_stack([np.interp(shares, stops, channel) for channel in EFFORT_COLORS.T])
+        yield from shape_items(node, shape, ghost=ghost, colors=colors)
+
+
+def mark_items(figure: Figure, index: int, mark: Mark) -> Iterator[Item]:
+    """The items of one of the marks of a robot, in its world or on its bodies."""
+    for item in mark.items:
+        root = f"notes{figure.number}" if item.body is None else f"{figure.node('robot', item.body)}/notes"
+        path = f"{root}/{index} {mark.kind} {label(mark.name)}/{item.node}".removesuffix("/")
+        yield replace(item, node=path)
 
 
 def _note(shown: Sequence[Shown], times: Floats) -> str:
