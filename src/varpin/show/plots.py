@@ -7,12 +7,12 @@ Figures are made without pyplot: nothing is shown, registered or configured glob
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import cycle, islice, product
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from varpin.study.record import Study
 
 Motion: TypeAlias = "Trajectory | Solution | MpcRun"
+Drawn: TypeAlias = tuple[Figure | SubFigure, Axes]
 
 # Okabe and Ito's palette for colour-blind readers, without its yellow, which is faint on white.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
@@ -38,6 +39,8 @@ DASHES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)), (0, (9
 _LIMITS, _NEAR = "limits", 0.3
 # Rows of a column of the legend.
 _LEGEND_ROWS = 20
+# Width of a line of a motion, in points.
+_WIDTH = 1.4
 # Look of a line that marks a value.
 _MARK: dict[str, Any] = {"color": "0.6", "linewidth": 0.8, "linestyle": "--", "zorder": 1}
 
@@ -50,9 +53,7 @@ class Line(NamedTuple):
     unit: str
 
 
-def plot_joints(
-    trajectory: Motion, axes: Axes | None = None, *, robot: Robot | None = None
-) -> tuple[Figure | SubFigure, Axes]:
+def plot_joints(trajectory: Motion, axes: Axes | None = None, *, robot: Robot | None = None) -> Drawn:
     """Joint positions over time.
 
     Args:
@@ -73,18 +74,14 @@ def plot_joints(
     return _draw(trajectory, trajectory.q, _of_joints(trajectory, robot, "position", ("rad", "m")), axes, limits)
 
 
-def plot_velocities(
-    trajectory: Motion, axes: Axes | None = None, *, robot: Robot | None = None
-) -> tuple[Figure | SubFigure, Axes]:
+def plot_velocities(trajectory: Motion, axes: Axes | None = None, *, robot: Robot | None = None) -> Drawn:
     """Joint velocities over time; arguments as for :func:`plot_joints`."""
     trajectory = _require_motion(trajectory, robot)
     limits = None if robot is None else (-robot.velocity_limit, robot.velocity_limit)
     return _draw(trajectory, trajectory.v, _of_joints(trajectory, robot, "velocity", ("rad/s", "m/s")), axes, limits)
 
 
-def plot_error(
-    trajectory: Motion, axes: Axes | None = None, *, robot: Robot | None = None
-) -> tuple[Figure | SubFigure, Axes]:
+def plot_error(trajectory: Motion, axes: Axes | None = None, *, robot: Robot | None = None) -> Drawn:
     """The estimated error of q over time, of a checked motion; arguments as for :func:`plot_joints`."""
     trajectory = _require_motion(trajectory, robot)
     if trajectory.error is None:
@@ -97,9 +94,7 @@ def plot_error(
     return figure, axes
 
 
-def plot_controls(
-    trajectory: Motion, axes: Axes | None = None, *, robot: Robot | None = None
-) -> tuple[Figure | SubFigure, Axes]:
+def plot_controls(trajectory: Motion, axes: Axes | None = None, *, robot: Robot | None = None) -> Drawn:
     """Controls over time: step functions, or lines where they are linear between nodes; as :func:`plot_joints`.
 
     Controls of position servos and kinematic inputs are commanded positions [rad or m]; the second control of a cubic
@@ -119,7 +114,7 @@ def plot_controls(
     return _draw(trajectory, trajectory.u_nodes if linear else trajectory.u, lines, axes, limits, steps=not linear)
 
 
-def plot_energy_error(trajectory: Motion, axes: Axes | None = None) -> tuple[Figure | SubFigure, Axes]:
+def plot_energy_error(trajectory: Motion, axes: Axes | None = None) -> Drawn:
     """Change of the energy [J], which is an error if no force drives or damps the robot; as :func:`plot_joints`."""
     trajectory = _require_motion(trajectory, None)
     figure, axes = _axes(axes)
@@ -159,7 +154,7 @@ def _share_legend(figure: Figure, panels: NDArray[Any]) -> None:
         figure.legend(shared.values(), shared.keys(), loc="outside right upper", frameon=False, fontsize="small")
 
 
-def plot_study(study: Study[Any], axes: Axes | None = None, **options: str) -> tuple[Figure | SubFigure, Axes]:
+def plot_study(study: Study[Any], axes: Axes | None = None, **options: str) -> Drawn:
     """What a study measured over time: a line for each method, circles on the Pareto front.
 
     A grey line marks the error of the reference.
@@ -182,16 +177,14 @@ def plot_study(study: Study[Any], axes: Axes | None = None, **options: str) -> t
     if not chart.front:
         raise InputError("no run has such a value, so there is nothing to plot")
     figure, axes = _axes(axes)
-    names = list(dict.fromkeys(name for name, _, _ in chart.points))
-    for name, style in zip(names, _styles(len(names)), strict=True):
+    for name in dict.fromkeys(name for name, _, _ in chart.points):
         curve = [(seconds, value) for label, seconds, value in chart.points if label == name]
-        axes.plot(*zip(*curve, strict=True), label=name, marker="o", markersize=4, **style)
+        axes.plot(*zip(*curve, strict=True), label=name, marker="o", markersize=4, linewidth=_WIDTH)
     ring: dict[str, Any] = {"marker": "o", "markersize": 9, "markerfacecolor": "none", "color": "0.3", "zorder": 1}
     axes.plot(*zip(*chart.front, strict=True), label="Pareto front", linestyle="none", **ring)
     axes.set(xscale="log", yscale="log" if chart.logarithmic else "linear")
     for name, (axis, value) in chart.marks.items():
         (axes.axvline if axis == "x" else axes.axhline)(value, label=name, **_MARK)
-    apply_style(axes)
     axes.legend(frameon=False, fontsize="small")
     axes.set(xlabel=chart.labels[0], ylabel=chart.labels[1])
     return figure, axes
@@ -223,17 +216,17 @@ def plot_identification(
     chosen, t, samples = [robot.coordinate(name) for name in names], found.logs[log].t, found.logs[log].q
     figure = Figure(figsize=(9.0, 1.7 * len(chosen) + 2.5), layout="constrained")
     panels = figure.subplots(len(chosen) + 1, 1, sharex=True, height_ratios=[*[2] * len(chosen), 3])
-    for c, panel, style in zip(chosen, panels, _styles(len(chosen)), strict=False):
+    for panel in panels:
+        apply_style(panel)
+    for c, panel in zip(chosen, panels, strict=False):
         panel.plot(t, samples[:, c], ".", label="measured", color="0.7", markersize=6)
         panel.set_ylim(panel.get_ylim())  # the motion before may be far away
         panel.plot(t, found.predicted_before[log][:, c], label="before", color="0.4", linestyle="--", linewidth=1.0)
         panel.plot(t, found.predicted[log][:, c], label="after", color="black", linewidth=0.8)
         panel.set_title(robot.joint_names[c], loc="left", fontsize="small")
         panel.set_ylabel(f"q [{joint_unit(robot, c)}]")
-        panels[-1].plot(t, found.residuals[log][:, c], label=robot.joint_names[c], **{**style, "linewidth": 0.8})
+        panels[-1].plot(t, found.residuals[log][:, c], label=robot.joint_names[c], linewidth=0.8)
     panels[-1].set(xlabel="time [s]", ylabel=f"residual [{joint_unit(robot, chosen)}]", xlim=(t[0], t[-1]))
-    for panel in panels:
-        apply_style(panel)
     _share_legend(figure, panels)
     figure.align_ylabels()
     return figure, panels
@@ -245,8 +238,10 @@ def apply_style(axes: Axes) -> None:
     Raises:
         InputError: ``axes`` are none of matplotlib's.
     """
-    _require_axes(axes)
-    axes.set_prop_cycle(color=COLORS)
+    if not isinstance(axes, Axes):
+        raise InputError(f"axes must be matplotlib's, such as matplotlib.figure.Figure().subplots(), got {axes!r}")
+    # All colours, then all colours dashed, and so on.
+    axes.set_prop_cycle(color=COLORS * len(DASHES), linestyle=[dash for dash in DASHES for _ in COLORS])
     axes.grid(visible=True, color="0.92", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -260,19 +255,19 @@ def _draw(
     limits: tuple[Floats, Floats] | None = None,
     *,
     steps: bool = False,
-) -> tuple[Figure | SubFigure, Axes]:
+) -> Drawn:
     """Values at nodes (N + 1, k), or over ``steps`` (N, k); names of lines tell what these do not have in common."""
     figure, axes = _axes(axes)
     whats = list(dict.fromkeys(line.what for line in lines))
     units = list(dict.fromkeys(line.unit for line in lines))
-    for row, line, style in zip(values.T, lines, _styles(len(lines)), strict=True):
+    if steps:
+        values = np.concatenate([values, values[-1:]])
+    t, curves = trajectory.t[: len(values)], list[Line2D]()
+    for row, line in zip(values.T, lines, strict=True):
         name = line.name + (f", {line.what}" if len(whats) > 1 else "") + (f" [{line.unit}]" if len(units) > 1 else "")
-        if steps:
-            axes.step(trajectory.t, np.append(row, row[-1:]), where="post", label=name, **style)
-        else:
-            axes.plot(trajectory.t, row, label=name, **style)
-    if limits is not None:
-        _draw_limits(axes, values, limits)
+        curves += axes.plot(t, row, label=name, linewidth=_WIDTH, drawstyle="steps-post" if steps else "default")
+    if limits is not None and values.size:
+        _draw_limits(axes, values, curves, limits)
     _finish(axes, trajectory, f"{whats[0] if len(whats) == 1 else 'control'} [{', '.join(units) or '1'}]")
     return figure, axes
 
@@ -316,40 +311,30 @@ def _of_controls(trajectory: Trajectory, robot: Robot | None) -> tuple[list[Line
     return lines, joints
 
 
-def _draw_limits(axes: Axes, values: Floats, limits: tuple[Floats, Floats]) -> None:
+def _draw_limits(axes: Axes, values: Floats, curves: Sequence[Line2D], limits: tuple[Floats, Floats]) -> None:
     """Draw limits as dotted lines in the colours of their joints, if values (N, k) come near them or pass them.
 
     Distant limits would compress the motion.
     """
-    if not values.size:
-        return
     low, high = float(values.min()), float(values.max())
     near = _NEAR * (high - low)
-    across, dots = axes.get_yaxis_transform(), (0, (1, 2))
-    look: dict[str, Any] = {"transform": across, "linewidth": 0.9, "linestyle": dots, "zorder": 1}
-    drawn = False
-    for k, style in enumerate(_styles(values.shape[1])):
-        for limit in (limits[0][k], limits[1][k]):
-            if low - near <= limit <= high + near:
-                # hlines adds a collection: the axes' lines are the joints.
-                axes.hlines(limit, 0.0, 1.0, color=style["color"], **look)
-                drawn = True
+    look: dict[str, Any] = {"linewidth": 0.9, "linestyle": (0, (1, 2)), "zorder": 1}
+    look["transform"] = axes.get_yaxis_transform()
+    found = [(at, curve) for curve, *both in zip(curves, *limits, strict=True) for at in both]
+    drawn = [(at, curve) for at, curve in found if low - near <= at <= high + near]
+    for at, curve in drawn:
+        # hlines adds a collection: the axes' lines are the joints.
+        axes.hlines(at, 0.0, 1.0, color=curve.get_color(), **look)
     if drawn:
         # The entry of the legend, of no joint's colour.
         axes.hlines([], 0.0, 1.0, color="0.3", label=_LIMITS, **look)
 
 
-def _axes(axes: Axes | None) -> tuple[Figure | SubFigure, Axes]:
-    if axes is None:
-        figure = Figure(figsize=(8.0, 4.5), layout="constrained")
-        return figure, figure.subplots()
-    _require_axes(axes)
+def _axes(axes: Axes | None) -> Drawn:
+    """The axes, or those of a new figure, in the style of all figures."""
+    axes = Figure(figsize=(8.0, 4.5), layout="constrained").subplots() if axes is None else axes
+    apply_style(axes)
     return axes.figure, axes
-
-
-def _require_axes(axes: object) -> None:
-    if not isinstance(axes, Axes):
-        raise InputError(f"axes must be matplotlib's, such as matplotlib.figure.Figure().subplots(), got {axes!r}")
 
 
 def _require_motion(given: object, robot: Robot | None) -> Trajectory:
@@ -363,16 +348,9 @@ def _require_motion(given: object, robot: Robot | None) -> Trajectory:
     return motion
 
 
-def _styles(lines: int) -> list[dict[str, Any]]:
-    """Distinct line styles: all colours, then all colours dashed, and so on."""
-    kinds = cycle(product(DASHES, COLORS))
-    return [{"color": color, "linestyle": dash, "linewidth": 1.4} for dash, color in islice(kinds, lines)]
-
-
 def _finish(axes: Axes, trajectory: Trajectory, label: str) -> None:
     axes.set_xlabel("time [s]")
     axes.set_ylabel(label)
-    apply_style(axes)
     if trajectory.duration > 0.0:
         axes.set_xlim(trajectory.t[0], trajectory.t[-1])
     else:
