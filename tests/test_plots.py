@@ -256,3 +256,5 @@ def test_free_motions_have_no_panel_of_controls_and_single_nodes_are_points():
         figure.canvas.draw()
         assert [panel.get_ylabel().split()[0] for panel in axes] == ["position", "velocity", "E(t)"]
         assert [line.get_marker() for line in axes[0].lines] == [marker] * 3
+        # Of a motion without steps, nothing.
+        assert len(plots.plot_controls(swing(steps=steps)[1])[1].lines) == 3

@@ -343,10 +343,10 @@ def test_ties_are_where_pinocchio_puts_the_points(show, browser, crank):
     scene, motion = crank
     show(scene.robot, motion, marks=vp.Marks(constraints=scene), fps=100.0)
     assert "constraint: PointOnPoint, PointOnPlane" in key(browser)
-    nodes = ["robot", "joint1", "moving", "joint2", "moving", "notes"]
+    nodes = ["robot", "0 joint1", "moving", "1 joint2", "moving", "notes"]
     kinds = ["0 constraint PointOnPoint", "1 constraint PointOnPlane", "2 constraint PointOnPlane"]
     assert names(browser, nodes) == kinds
-    base = ["robot", "base", "notes"]
+    base = ["robot", "notes"]
     assert [names(browser, [*base, kind]) for kind in names(browser, base)] == [["b"], ["plane"], ["plane"]]
     for k in (0, 7, 20):
         seek(browser, 0.02 * k)
@@ -368,7 +368,7 @@ def test_a_line_and_a_weld_are_drawn(show, browser):
     grip[:3, 3] = [0.0, 0.0, 0.4]
     line = vp.PointOnLine("tip", (0.0, 0.0, -1.0), (1.0, 0.0, 0.0))
     show(robot, q, dt=1.0, marks=vp.Marks(constraints=vp.Scene(robot, constraints=line)))
-    along = tube(browser, ["robot", "base", "notes", "0 constraint PointOnLine", "line"])
+    along = tube(browser, ["robot", "notes", "0 constraint PointOnLine", "line"])
     np.testing.assert_allclose(along[:, 1:], [[0.0, -1.0]] * len(along), atol=1e-6)
     weld = vp.Scene(robot, constraints=vp.FrameOnFrame("tip", "joint2", grip))
     show(robot, q, dt=1.0, marks=vp.Marks(constraints=weld))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from varpin.errors import UnknownFrame
+from varpin.errors import InputError, UnknownFrame
 from varpin.model import Robot
 from varpin.support.checks import tuple_of
 from varpin.trajectory import Trajectory
@@ -21,6 +21,15 @@ def motion_of(given: object) -> Any:
     """The motion of a plan or of a controller's run; anything else is returned as it is."""
     own = (getattr(given, name, None) for name in ("trajectory", "motion"))
     return next((motion for motion in own if isinstance(motion, Trajectory)), given)
+
+
+def require_joints(name: str, motion: Trajectory, robot: Robot) -> None:
+    """Refuse a motion of a robot with other joints."""
+    if motion.joint_names != robot.joint_names:
+        raise InputError(
+            f"the {name} is of robot {motion.robot!r} with joints {', '.join(motion.joint_names)}; {robot.name!r} has "
+            f"joints {', '.join(robot.joint_names)}"
+        )
 
 
 def problem_of(given: object) -> OptimalControlProblem | None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.model import Robot, joint_unit, require_robot
-from varpin.show.given import motion_of, problem_of
+from varpin.show.given import motion_of, problem_of, require_joints
 from varpin.support.checks import count, tuple_of
 from varpin.trajectory import Trajectory, kinematic_input_rows, require_trajectory, scene_indices
 
@@ -340,11 +340,8 @@ def _axes(axes: Axes | None) -> Drawn:
 def _require_motion(given: object, robot: Robot | None) -> Trajectory:
     """The motion; refuses anything but a trajectory, a plan and a run, and a robot that is not the motion's."""
     motion = require_trajectory(motion_of(given))
-    if robot is not None and require_robot(robot).joint_names != motion.joint_names:
-        raise InputError(
-            f"robot {robot.name!r} has joints {', '.join(robot.joint_names)}; "
-            f"the trajectory has {', '.join(motion.joint_names)}"
-        )
+    if robot is not None:
+        require_joints("motion", motion, require_robot(robot))
     return motion
 
 

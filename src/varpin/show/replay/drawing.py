@@ -9,7 +9,7 @@ import numpy as np
 from meshcat.animation import Animation, AnimationClip, AnimationTrack
 
 from varpin.arrays import Floats
-from varpin.show.replay.figure import across
+from varpin.show.replay.figure import Figure
 from varpin.show.replay.shapes import transform
 from varpin.show.replay.stage import Stage
 
@@ -24,7 +24,7 @@ _KINDS = {"position": "vector3", "scale": "vector3", "quaternion": "quaternion",
 
 def draw(viewer: meshcat.Visualizer, stage: Stage) -> None:
     """Send everything to a viewer."""
-    set_view(viewer, stage.points, stage.toward, stage.size)
+    set_view(viewer, stage.points, stage.figures[0])
     clips: dict[meshcat.path.Path, AnimationClip] = {}
     for item in stage.items():
         node = viewer[item.node]
@@ -42,19 +42,19 @@ def draw(viewer: meshcat.Visualizer, stage: Stage) -> None:
         viewer.set_animation(Animation(clips), play=True, repetitions=math.inf)
 
 
-def set_view(viewer: meshcat.Visualizer, points: Floats, toward: Floats, size: float, *, camera: bool = True) -> None:
-    """Set the camera in a direction (3,) from points (P, 3) [m], the grid at z = 0, axes and background.
+def set_view(viewer: meshcat.Visualizer, points: Floats, figure: Figure, *, camera: bool = True) -> None:
+    """Set the camera so that it sees points (P, 3) [m], the grid at z = 0, axes and background.
 
-    With ``camera=False`` the present camera is moved. ``size`` is that of one robot's motion [m].
+    With ``camera=False`` the present camera is moved.
     """
-    right = across(toward)
-    axes = np.array([right, np.cross(toward, right), toward])
+    toward = figure.toward
+    axes = np.array([figure.right, figure.up, toward])
     seen = points @ axes.T
     middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0))
     width, up, depth = (seen - middle).T
     tangent = math.tan(0.5 * _VERTICAL_VIEW)
     distance = _MARGIN * float(np.max(depth + np.maximum(np.abs(width) / (_ASPECT * tangent), np.abs(up) / tangent)))
-    distance = distance or size
+    distance = distance or figure.size
 
     # meshcat's camera turns about the origin only, so the middle of the motion is moved there.
     shift = -(middle @ axes)
@@ -71,7 +71,7 @@ def set_view(viewer: meshcat.Visualizer, points: Floats, toward: Floats, size: f
     # That node turns three.js's upward y into the world's z.
     viewer["/Cameras/default/rotated/<object>"].set_property("position", [offset[0], offset[2], -offset[1]])
 
-    cell = _round_number(size / 8.0)
+    cell = _round_number(figure.size / 8.0)
     scale = [cell / _GRID_CELL] * 3
     viewer["/Grid"].set_property("color", [1.0, 1.0, 1.0, 0.3])
     viewer["/Grid"].set_property("scale", scale)

@@ -17,8 +17,8 @@ from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.marks import Marks
 from varpin.model import Robot
-from varpin.show.given import motion_of
-from varpin.show.replay.picture import Picture
+from varpin.show.given import motion_of, require_joints
+from varpin.show.replay.picture import Picture, label
 from varpin.support.checks import as_floats, flag, positive, require_finite
 from varpin.trajectory import Trajectory, kinematic_input_rows
 
@@ -130,14 +130,27 @@ class Figure:
         return self.rows["robot"]
 
     @cached_property
+    def right(self) -> Floats:
+        """The horizontal unit vector (3,) that the camera sees pointing to the right."""
+        right = np.cross([0.0, 0.0, 1.0], self.toward)
+        return np.asarray(right / np.linalg.norm(right))
+
+    @property
+    def up(self) -> Floats:
+        """The unit vector (3,) that the camera sees pointing upwards."""
+        return np.cross(self.toward, self.right)
+
+    @cached_property
     def poses(self) -> tuple[Floats, Floats]:
         """World rotations (K, b, 3, 3) and positions (K, b, 3) [m] of the bodies."""
         return self.picture.body_poses(self.q)
 
     def node(self, kind: str, body: int) -> str:
-        """Scene path of a body, -1 for the base, of the "robot" or the "ghost"."""
-        root = f"{kind}{self.number}"
-        return self.picture.moving_nodes(root)[body] if body >= 0 else f"{root}/base"
+        """Scene path of a body of the "robot" or the "ghost", each below that of its parent; -1 for the base."""
+        if body < 0:
+            return f"{kind}{self.number}"
+        parent = self.node(kind, int(self.robot.tree.parent[body]))
+        return f"{parent}/{body} {label(self.robot.model.names[body + 1])}/moving"
 
 
 def require_marks(marks: Marks | None) -> Marks:
@@ -154,11 +167,7 @@ def read_motion(
 ) -> tuple[Floats, Floats]:
     """Times (N + 1,) from 0 [s], with ``dt`` or up to an ``end``, and configurations (N + 1, n)."""
     if isinstance(motion, Trajectory):
-        if motion.joint_names != robot.joint_names:
-            raise InputError(
-                f"the {name} is of robot {motion.robot!r} with joints {', '.join(motion.joint_names)}; "
-                f"{robot.name!r} has joints {', '.join(robot.joint_names)}"
-            )
+        require_joints(name, motion, robot)
         for what in ("rotation", "translation"):
             saved, present = motion.scene_values.get(what), getattr(robot.tree, what)
             if saved is not None and (saved.shape != present.shape or not np.allclose(saved, present, atol=1e-9)):
@@ -245,9 +254,3 @@ def rows_at(times: Floats, t: Floats, rows: Floats) -> Floats:
 def samples(rows: Floats) -> Floats:
     """Up to 50 of the rows, the first and the last among them."""
     return rows[np.unique(np.linspace(0, len(rows) - 1, 50).astype(int))]
-
-
-def across(toward: Floats) -> Floats:
-    """The horizontal unit vector (3,) that a camera in the direction ``toward`` sees pointing to the right."""
-    right = np.cross([0.0, 0.0, 1.0], toward)
-    return np.asarray(right / np.linalg.norm(right))

@@ -112,6 +112,7 @@ class LiveView:
         start = np.clip(np.zeros(robot.dof), lower, upper)
         self._q = np.asarray(getattr(source, "q0", start), dtype=np.float64)
         self._stage = Stage.of([Shown(robot, source, marks, np.zeros(1), self._q[None])])
+        self._size = self._stage.figures[0].size
         self._path: dict[str, list[Floats]] = {name: [] for name in self._stage.figures[0].trace}
         open = flag("open", open)
         self._text, self._text_time = "", -math.inf
@@ -257,17 +258,17 @@ class LiveView:
     def _keep_in_view(self, points: Floats) -> None:
         """Move the camera back if points (P, 3) are outside its view."""
         low, high = self._in_view.min(axis=0), self._in_view.max(axis=0)
-        edge = _EDGE * self._stage.size
+        edge = _EDGE * self._size
         if (points >= low - edge).all() and (points <= high + edge).all():
             return
         # Twice as far as necessary, so that the camera does not move with every picture.
         out = points + np.where(points > high, points - high, 0.0) - np.where(points < low, low - points, 0.0)
         self._in_view = np.concatenate([self._in_view, points, out])
-        set_view(self._viewer, self._in_view, self._stage.toward, self._stage.size, camera=False)
+        set_view(self._viewer, self._in_view, self._stage.figures[0], camera=False)
 
     def _draw_path(self, q: Floats) -> None:
         """Extend the paths of the traced frames over configurations (k, n)."""
-        size = self._stage.size
+        size = self._size
         for name, path in self._path.items():
             for point in self.robot.frame_positions(q, name):
                 if not path or np.linalg.norm(point - path[-1]) > _APART * size:
@@ -284,7 +285,7 @@ class LiveView:
             return
         low, high = self._in_view.min(axis=0), self._in_view.max(axis=0)
         self._viewer["notes/words"].set_transform(shapes.transform(np.array([*(0.5 * (low + high))[:2], low[2]])))
-        self._viewer["notes/words"].set_object(shapes.Label(words, LABEL * self._stage.size, 0.0))
+        self._viewer["notes/words"].set_object(shapes.Label(words, LABEL * self._size, 0.0))
         self._text, self._text_time = words, now
 
 

@@ -22,7 +22,7 @@ from varpin.model.kinematics import place_on_body
 from varpin.model.tree import place_of_frame, z_to
 from varpin.show.given import problem_of
 from varpin.show.replay import shapes
-from varpin.show.replay.figure import Figure, across, rows_at, samples
+from varpin.show.replay.figure import Figure, rows_at, samples
 from varpin.show.replay.picture import corners_of
 from varpin.support.checks import as_floats, require_finite
 
@@ -165,8 +165,7 @@ def _targets(figure: Figure) -> Iterator[Mark]:
 
 def _target(figure: Figure, name: str, places: Floats, turns: Floats | None = None) -> Mark:
     """A ball with a label, and axes for a pose, at positions (1 or K, 3) with quaternions (x, y, z, w), as many."""
-    size, right = figure.size, across(figure.toward)
-    up = np.cross(figure.toward, right)
+    size, right, up = figure.size, figure.right, figure.up
     items = [
         shapes.Item.moving("", None, places, turns),
         shapes.Item("ball", shapes.sphere(_BALL * size, KINDS["target"][1], "soft")),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -64,14 +64,6 @@ class Picture:
         ]
         return cls(robot, shapes)
 
-    def moving_nodes(self, root: str) -> list[str]:
-        """Scene path below ``root`` of each body (b,)."""
-        names = labels(self.robot.model.names[1:])
-        nodes: list[str] = []
-        for name, parent in zip(names, self.robot.tree.parent, strict=True):
-            nodes.append(f"{nodes[parent] if parent >= 0 else root}/{name}/moving")
-        return nodes
-
     def body_poses(self, q: Floats) -> tuple[Floats, Floats]:
         """World rotation (S, b, 3, 3) and position (S, b, 3) [m] of each body at configurations (S, n)."""
         tree, q = self.robot.tree, np.ascontiguousarray(q)
@@ -105,21 +97,6 @@ def corners_of(box: Floats) -> Floats:
 def label(name: str) -> str:
     """A name as one step of a scene path."""
     return name.replace("/", "_") or "_"
-
-
-# Steps of scene paths that no joint may have.
-_TAKEN = ("base", "shapes", "notes", "<object>")
-
-
-def labels(names: Iterable[str]) -> list[str]:
-    """Names as distinct steps of scene paths."""
-    found: dict[str, None] = dict.fromkeys(_TAKEN)
-    for name in names:
-        step, count = label(name), 2
-        while step in found:
-            step, count = f"{label(name)} {count}", count + 1
-        found[step] = None
-    return list(found)[len(_TAKEN) :]
 
 
 def _skeleton(robot: Robot) -> Iterator[pin.GeometryObject]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.show.given import frame_names, motion_of
-from varpin.show.replay.figure import MOST_FRAMES, Figure, Shown, across, keyframe_times, rows_at, samples
+from varpin.show.replay.figure import MOST_FRAMES, Figure, Shown, keyframe_times, rows_at, samples
 from varpin.show.replay.marks import REGIONS, Mark, marks_of
 from varpin.show.replay.picture import Picture, label
 from varpin.show.replay.shapes import Item, shape_items, transform
@@ -36,8 +36,6 @@ class Stage:
     marks: Sequence[Sequence[Mark]]  # of each figure
     places: Sequence[Floats]  # position of the world of each (3,) [m]
     points: Floats  # points around everything that is shown (P, 3) [m]
-    toward: Floats  # unit vector (3,) to the camera
-    size: float  # size of the largest robot's motion [m]
     speed: float  # seconds of motion in a second of playback
     note: str  # how far the picture may be off in words, for the legend; empty where nothing is known
 
@@ -73,9 +71,9 @@ class Stage:
         ]
         marks = [list(marks_of(figure)) for figure in figures]
         extents = [_extent(figure, own) for figure, own in zip(figures, marks, strict=True)]
-        places = side_by_side(extents, toward)
+        places = side_by_side(extents, figures[0].right)
         points = np.concatenate([points + place for points, place in zip(extents, places, strict=True)])
-        return cls(times / speed, figures, marks, places, points, toward, size, speed, _note(shown, times))
+        return cls(times / speed, figures, marks, places, points, speed, _note(shown, times))
 
     def items(self) -> Iterator[Item]:
         """Everything that is drawn."""
@@ -148,9 +146,8 @@ def _extent(figure: Figure, marks: Sequence[Mark]) -> Floats:
     return np.concatenate([points, *(np.clip(region, low - margin, high + margin) for region in regions)])
 
 
-def side_by_side(extents: Sequence[Floats], toward: Floats) -> list[Floats]:
-    """Translations (3,) that put figures, each of points (P, 3) [m], in a row as the camera sees them."""
-    right = across(toward)
+def side_by_side(extents: Sequence[Floats], right: Floats) -> list[Floats]:
+    """Translations (3,) that put figures, each of points (P, 3) [m], in a row to the right."""
     spans = [((points @ right).min(), (points @ right).max()) for points in extents]
     gap = _GAP * max(high - low for low, high in spans)
     at, places = 0.0, [np.zeros(3)]
