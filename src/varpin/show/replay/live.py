@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 import meshcat
@@ -116,7 +115,6 @@ class LiveView:
         self._path: dict[str, list[Floats]] = {name: [] for name in self._stage.figures[0].trace}
         open = flag("open", open)
         self._text, self._text_time = "", -math.inf
-        self._closed = False
         self._drawn = -math.inf
         self._window = _Window()
         self.url: str = self._window.web_url
@@ -131,15 +129,13 @@ class LiveView:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self.close()
 
     def wait(self, seconds: float = _BROWSER_LIMIT) -> bool:
         """Wait until a browser shows the robot, at most ``seconds``; returns whether one does, and warns if not."""
         end = time.monotonic() + positive("seconds", seconds, "s")
-        if not self._silent and self._window.connected.wait(seconds):
+        if not self._window.lost and self._window.connected.wait(seconds):
             # A browser needs some seconds to draw large meshes.
             with self._sending():
                 if self._window.has_drawn(max(0.1, end - time.monotonic())):
@@ -149,11 +145,10 @@ class LiveView:
 
     def close(self) -> None:
         """End the server. The browser keeps its last picture."""
-        self._closed = True
         self._window.close()
 
     def __repr__(self) -> str:
-        return f"LiveView({self.robot.name} at {self.url}{', closed' if self._closed else ''})"
+        return f"LiveView({self.robot.name} at {self.url}{', closed' if self._window.lost else ''})"
 
     def _repr_html_(self) -> str:
         """The window in a frame of a notebook that runs on this machine."""
@@ -178,7 +173,7 @@ class LiveView:
                 f"the view is of robot {self.robot.name!r} with {self.robot.dof} joints, and the motion of one with "
                 f"{q.shape[1]}"
             )
-        if self._silent:
+        if self._window.lost:
             return
         with self._sending():
             if t[0] == 0.0:
@@ -190,10 +185,6 @@ class LiveView:
                 self._move(t, q, float(t[-1]), of)
             if done == steps:
                 self._move(t, q, float(t[-1]), of, last=True)
-
-    @property
-    def _silent(self) -> bool:
-        return self._closed or self._window.lost
 
     @contextlib.contextmanager
     def _sending(self) -> Iterator[None]:
@@ -294,7 +285,7 @@ class _Window(ViewerWindow):
 
     Attributes:
         connected: Set once a browser has connected.
-        lost: Whether the server has ended.
+        lost: Whether the server has ended or was closed.
     """
 
     def __init__(self) -> None:
