@@ -271,7 +271,7 @@ SAME = {
     "torques of paths": lambda x: vp.simulate_ensemble(SCENE, ROW, ROW, controls=x, paths=1, rng=0, **STEPS).u[0],
     "problem": lambda x: [problem(x, x).q0, problem(x, x).v0, problem().at(q0=x).q0],
     "jet": lambda x: [vp.lagrangian_jet(SCENE, x, x, backend=name).Lq for name in ("compiled", "pinocchio")],
-    "report": lambda x: [vp.inspect_robot(UR5, q=x, v=x).q, vp.inspect_robot(UR5, q=x, v=x).v],
+    "report": lambda x: vp.inspect_robot(UR5, q=x).q,
     "discrete Lagrangian": lambda x: vp.discrete_lagrangian(SCENE, x, x, 0.01).D1,
     "noise": lambda x: motion(scene=vp.Scene(UR5, noise=vp.AdditiveNoise(x) + vp.StateNoise(x, 0.1)), rng=5).q,
     "noise's middle": lambda x: motion(scene=vp.Scene(UR5, noise=vp.StateNoise(1.0, x)), rng=5).q,

@@ -7,12 +7,10 @@ import logging
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from varpin.cli.arguments import (
-    add_gravity,
     add_robot,
     add_robot_options,
     add_vector,
@@ -109,15 +107,13 @@ def _robot(request: argparse.Namespace, motion: Trajectory) -> tuple[Robot, Scen
 def add_inspect(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin inspect``."""
     parser.description = (
-        "Print a robot's joints, links, masses and frames, the largest step that Midpoint accepts, and whatever looks "
-        "wrong. Takes robots that simulate refuses."
+        "Print a robot's joints, links, masses and frames, and whatever looks wrong. Takes robots that simulate "
+        "refuses."
     )
     # The report repeats the warnings of loading.
     parser.set_defaults(run=_inspect, log_level=logging.ERROR)
     add_robot(parser, scenes=True)
     add_vector(parser, "q", "configuration of the report [rad or m]; default: 0")
-    add_vector(parser, "v", "velocity of the report [rad/s or m/s]; default: 0")
-    add_gravity(parser)
 
 
 def _inspect(request: argparse.Namespace, _errors: Console) -> int:
@@ -127,8 +123,7 @@ def _inspect(request: argparse.Namespace, _errors: Console) -> int:
         rows.append(("horizon", f"{file.steps} steps of {file.dt:g} s, {file.integrator}"))
         show(Table(f"{file.title} ({file.path.name})", (), rows))
         return 0
-    values: dict[str, Any] = {name: values_of(name, getattr(request, name)) for name in ("q", "v")}
-    show(inspect_robot(request.robot, **values, gravity=request.gravity, **robot_options(request)))
+    show(inspect_robot(request.robot, q=values_of("q", request.q), **robot_options(request)))
     return 0
 
 

@@ -8,7 +8,6 @@ from varpin.integrators.explicit import ExplicitEuler as ExplicitEuler
 from varpin.integrators.explicit import RungeKutta4 as RungeKutta4
 from varpin.integrators.explicit import SemiImplicitEuler as SemiImplicitEuler
 from varpin.integrators.midpoint import Midpoint as Midpoint
-from varpin.integrators.midpoint import largest_step as largest_step
 from varpin.integrators.reference import Reference as Reference
 from varpin.integrators.registry import BY_NAME as BY_NAME
 from varpin.integrators.registry import integrator_of as integrator_of

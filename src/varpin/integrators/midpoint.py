@@ -1,7 +1,4 @@
-"""The midpoint variational integrator.
-
-Equation (G2) of docs/mathematics.md.
-"""
+"""The midpoint variational integrator."""
 
 from __future__ import annotations
 
@@ -9,25 +6,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import scipy
 
 from varpin.arrays import Floats
 from varpin.core import Tableau
 from varpin.integrators.tableau import gauss_coefficients, lobatto_places, midpoint
 from varpin.integrators.variational import Guard, Variational
 from varpin.support.checks import fraction
-
-
-def largest_step(M: Floats, Lqq: Floats, margin: float) -> float:
-    """The largest dt [s] of steps that the branch guard accepts with alpha = 1/2 near a state with these M and L_qq.
-
-    Equation (G2). At this dt, M - dt^2 / (4 (1 - margin)) L_qq ceases to be positive definite. It is infinite if no
-    direction is unstable. It is no measure of accuracy.
-    """
-    rates = scipy.linalg.eigh(Lqq, M, eigvals_only=True)
-    # Zero curvature gives tiny eigenvalues of either sign by rounding.
-    rounding = 1e-12 * float(np.abs(rates).max())
-    return 2.0 * float(np.sqrt((1.0 - margin) / rates[-1])) if rates[-1] > rounding else np.inf
 
 
 @dataclass(frozen=True)

@@ -12,20 +12,16 @@ from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError, SingularMassMatrix
-from varpin.integrators import Guard, largest_step
-from varpin.mechanics.lagrangian import lagrangian_jet
-from varpin.mechanics.scene import Scene
 from varpin.model import Robot, check_inertia, longest_reach, readable_geometry
 from varpin.model.inertia import fault, inertials_of, one_of_each, principal_moments
 from varpin.model.loading import load_robot, unchecked_robot
 from varpin.model.meshes import shape_points
 from varpin.model.mimic import joint_index
 from varpin.model.robot import limits_of
-from varpin.model.tree import is_unbounded, joint_axis
+from varpin.model.tree import is_unbounded, joint_axis, mechanism
 from varpin.model.urdf import listed
 from varpin.support import markup
 from varpin.support.checks import JointValues, flag, joint_array
@@ -35,8 +31,6 @@ from varpin.support.tables import Table
 Kind = Literal["revolute", "prismatic", "continuous", "mimic"]
 FrameKind = Literal["link", "joint", "fixed joint", "frame"]
 
-# A largest step beyond this counts as no limit [s].
-_ANY_STEP = 100.0
 # Largest plausible condition number of M with a unit diagonal; 830 among the arms of example-robot-data.
 CONDITION = 1e6
 # Largest plausible radius of gyration and centre of mass distance of a link, as a multiple of the arm's reach, and [m]
@@ -136,12 +130,8 @@ class RobotReport(Frozen):
         locked: Locked joints and their positions [rad or m].
         total_mass: Mass of all moving links [kg].
         q: Configuration of the report (n,) [rad or m].
-        v: Velocity of the report (n,) [rad/s or m/s].
         condition: Condition number of M(q) with rows and columns scaled to a unit diagonal, which does not depend on
             units. Infinite if M is singular.
-        largest_step: Largest dt [s] whose step the midpoint integrator's branch guard accepts around (q, v); infinite
-            where no direction is unstable, None where M is singular. It is not a measure of accuracy.
-        branch_margin: The guard's margin, for which ``largest_step`` holds.
         warnings: What looks wrong, in words that name the joint or link.
     """
 
@@ -152,10 +142,7 @@ class RobotReport(Frozen):
     locked: Mapping[str, float | tuple[float, ...]]
     total_mass: float
     q: Floats
-    v: Floats
     condition: float
-    largest_step: float | None
-    branch_margin: float
     warnings: tuple[str, ...]
 
     def __repr__(self) -> str:
@@ -192,7 +179,6 @@ class RobotReport(Frozen):
             ("degrees of freedom", self.robot.dof),
             ("mass that moves [kg]", f"{self.total_mass:.5g}"),
             ("at q [rad or m]", "  ".join(f"{x:g}" for x in self.q)),
-            ("largest step of Midpoint", self.step_in_words),
         ]
         units = {"rad": "[rad]", "m": "[m]"}
         unit = units.get("".join({j.unit for j in self.joints}), "[rad or m]")
@@ -206,15 +192,6 @@ class RobotReport(Frozen):
             Table(f"{name}: frames", ("frame", "what it is", "on", "moved by"), frames),
             Table(f"{name}: as a whole", (), whole),
         )
-
-    @property
-    def step_in_words(self) -> str:
-        """The largest step that the midpoint integrator accepts around (q, v), in words."""
-        if self.largest_step is None:
-            return "undefined: the mass matrix is singular"
-        # Rounded numbers in a description, such as a turn by 1.5708, make neutral directions slightly unstable.
-        step = "any: nothing is unstable" if self.largest_step > _ANY_STEP else f"{self.largest_step:.3g} s"
-        return f"{step} at this q, {'at rest' if not self.v.any() else 'and this v'}"
 
     def _repr_html_(self) -> str:
         joints, links, frames, whole = self.tables
@@ -240,8 +217,6 @@ def inspect_robot(
     source: object,
     *,
     q: JointValues | None = None,
-    v: JointValues | None = None,
-    gravity: ArrayLike | bool = True,
     meshes: bool = True,
     **loading: Any,
 ) -> RobotReport:
@@ -250,15 +225,12 @@ def inspect_robot(
     Args:
         source: A source as for :func:`varpin.load_robot`, or a loaded robot.
         q: Configuration of the report: one number, (n,) or by joint name [rad or m]; 0 if left out.
-        v: Velocity of the report, likewise [rad/s or m/s]; 0 if left out.
-        gravity: As for :class:`varpin.Scene`; the largest step depends on it.
         meshes: Whether to compare inertias with the sizes of meshes, which takes seconds if their files are large.
         loading: Options of :func:`varpin.load_robot`, such as ``lock``.
 
     Raises:
         RobotError: As for :func:`varpin.load_robot`, except for singular mass matrices.
-        InputError: ``q`` or ``v`` has a wrong shape or is not finite, or options of loading are given with a loaded
-            robot.
+        InputError: ``q`` has a wrong shape or is not finite, or options of loading are given with a loaded robot.
     """
     if isinstance(source, Robot):
         if given := [name for name, value in loading.items() if value is not None]:
@@ -268,15 +240,12 @@ def inspect_robot(
         options = signature(load_robot).bind(source, **loading)
         options.apply_defaults()
         robot = unchecked_robot(**options.arguments)
-    scene = Scene(robot, gravity=gravity, damping=0.0, constraints=())
     configuration = joint_array("q", 0.0 if q is None else q, robot.joint_names, uniform=True)
-    velocity = joint_array("v", 0.0 if v is None else v, robot.joint_names, uniform=True)
     with np.errstate(all="ignore"):
-        jet = lagrangian_jet(scene, configuration, velocity, backend="pinocchio")
-    if not all(np.isfinite(array).all() for array in (jet.Lvv, jet.Lqq)):
-        raise RobotError(f"robot {robot.name!r} cannot be inspected: its mass matrix or its derivatives are not finite")
-    margin = Guard().branch_margin
-    condition = _condition_number(jet.Lvv)
+        M = mechanism(robot.tree).jet(configuration, np.zeros(robot.dof))[-1]
+    if not np.isfinite(M).all():
+        raise RobotError(f"robot {robot.name!r} cannot be inspected: its mass matrix is not finite")
+    condition = _condition_number(M)
     links = _links(robot)
     shapes, unread = readable_geometry(robot) if flag("meshes", meshes) else (pin.GeometryModel(), {})
     warnings = [
@@ -296,10 +265,7 @@ def inspect_robot(
         locked=robot.locked,
         total_mass=float(robot.tree.mass.sum()),
         q=configuration,
-        v=velocity,
         condition=condition,
-        largest_step=largest_step(jet.Lvv, jet.Lqq, margin) if np.isfinite(condition) else None,
-        branch_margin=margin,
         warnings=tuple(warnings),
     )
 
