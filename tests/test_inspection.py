@@ -57,7 +57,6 @@ def test_sound_arm_gives_no_warning_and_its_figures(tmp_path):
     ("links", "facts"),
     [
         ((ROD, None), ("massless", "'link2'", "'joint2'", "nothing")),
-        ((None, ROD), ("massless", "'link1'", "'joint1'", "only")),
         ((ROD, inertial(1, 0, 0, 0)), ("point mass", "'link2'", "1 kg")),
         ((ROD, inertial(1, -0.02, 0.08, 0.08)), (ODD, "'link2'", "positive definite", "-0.02, 0.08, 0.08")),
         ((ROD, inertial(1, 0.01, 0.02, 0.08)), (ODD, "'link2'", "triangle inequality", "0.08 > 0.01 + 0.02")),

@@ -336,14 +336,12 @@ def _frames(robot: Robot) -> tuple[FrameReport, ...]:
 
 def _mass_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
     tree, names = robot.tree, [part.link for part in inertials_of(robot.model)]
-    for body, mass in enumerate(tree.mass):
-        name, joint = names[body], robot.model.names[body + 1]
-        if mass == 0.0:
-            carries = "only the links that it carries give the joint inertia"
-            if body not in tree.parent:
-                carries = "and it carries nothing"
-            yield "massless", name, f"link {name!r} is massless, yet joint {joint!r} moves it; {carries}"
-        elif not tree.inertia[body].any():
+    for body, (name, mass) in enumerate(zip(names, tree.mass, strict=True)):
+        # A massless link that carries others is sound: their joints move them.
+        if mass == 0.0 and body not in tree.parent:
+            joint = robot.model.names[body + 1]
+            yield "massless", name, f"link {name!r} is massless and carries nothing, yet joint {joint!r} moves it"
+        elif mass != 0.0 and not tree.inertia[body].any():
             yield "point mass", name, f"link {name!r} has a mass of {mass:g} kg and no rotational inertia: a point mass"
 
 
@@ -360,15 +358,15 @@ def _inertia_warnings(
     for link in links:
         if not link.joint:
             continue
-        name, away = link.name, float(np.linalg.norm(link.center))
+        name, mass, away = f"link {link.name!r}", link.mass, float(np.linalg.norm(link.center))
         if away > length:
-            far = f"link {name!r} has its centre of mass {away:.3g} m away from its frame, {span}"
-            yield "away", name, f"{far}; are these millimetres?"
-        kind, sentence = fault(name, link.mass, link.moments)
-        if kind or link.mass <= 0.0 or not link.inertia.any():
-            yield kind, name, sentence
+            far = f"{name} has its centre of mass {away:.3g} m away from its frame, {span}; are these millimetres?"
+            yield "away", link.name, far
+        kind, sentence = fault(link.name, mass, link.moments)
+        if kind or mass <= 0.0 or not link.inertia.any():
+            yield kind, link.name, sentence
             continue
-        frame, against, size = frames.get(name), span, np.inf
+        against, size, frame = span, np.inf, frames.get(link.name)
         if frame is not None and frame.parentJoint in around:
             points, center = np.vstack(around[frame.parentJoint]), frame.placement.act(link.center)
             size = float(np.linalg.norm(points - center, axis=1).max())
@@ -379,15 +377,15 @@ def _inertia_warnings(
         if SIZE_RATIO * size < length:
             against = f"and its body reaches {size:.2g} m from its centre of mass"
         # A ball has the least inertia of all bodies of a given mass and density.
-        radius = (3.0 * link.mass / (4.0 * np.pi * DENSITY)) ** (1.0 / 3.0)
-        gyration = float(np.sqrt(link.moments[-1] / link.mass))
-        if link.moments.sum() < 1.2 * link.mass * radius**2:
+        radius = (3.0 * mass / (4.0 * np.pi * DENSITY)) ** (1.0 / 3.0)
+        gyration = float(np.sqrt(link.moments[-1] / mass))
+        odd = f"{name} has an implausibly {{}} inertia: {{}}"
+        if link.moments.sum() < 1.2 * mass * radius**2:
             moments = ", ".join(f"{moment:.3g}" for moment in link.moments)
-            sentence = f"link {name!r} has an implausibly small inertia: {link.mass:g} kg with principal moments "
-            yield "small", name, f"{sentence}{moments} kg m^2 would be denser than osmium"
+            dense = f"{mass:g} kg with principal moments {moments} kg m^2 would be denser than osmium"
+            yield "small", link.name, odd.format("small", dense)
         elif gyration > min(length, SIZE_RATIO * size):
-            sentence = f"link {name!r} has an implausibly large inertia: its radius of gyration is {gyration:.3g} m, "
-            yield "large", name, sentence + against
+            yield "large", link.name, odd.format("large", f"its radius of gyration is {gyration:.3g} m, {against}")
 
 
 def _joint_origins(robot: Robot, joint: int) -> Iterator[Floats]:
