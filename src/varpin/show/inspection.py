@@ -358,49 +358,42 @@ def _inertia_warnings(
     for link in links:
         if not link.joint:
             continue
-        name, mass, away = f"link {link.name!r}", link.mass, float(np.linalg.norm(link.center))
+        where, away = f"link {link.name!r} has its centre of mass", float(np.linalg.norm(link.center))
         if away > length:
-            far = f"{name} has its centre of mass {away:.3g} m away from its frame, {span}; are these millimetres?"
-            yield "away", link.name, far
-        kind, sentence = fault(link.name, mass, link.moments)
-        if kind or mass <= 0.0 or not link.inertia.any():
+            yield "away", link.name, f"{where} {away:.3g} m away from its frame, {span}; are these millimetres?"
+        kind, sentence = fault(link.name, link.mass, link.moments)
+        if kind or link.mass <= 0.0 or not link.inertia.any():
             yield kind, link.name, sentence
             continue
-        against, size, frame = span, np.inf, frames.get(link.name)
+        frame, size = frames.get(link.name), np.inf
         if frame is not None and frame.parentJoint in around:
             points, center = np.vstack(around[frame.parentJoint]), frame.placement.act(link.center)
             size = float(np.linalg.norm(points - center, axis=1).max())
-            outside, box = _outside(np.vstack([points, *_joint_origins(robot, frame.parentJoint)]), center)
+            # Around the shapes, the joint and those that it carries.
+            carried = [robot.model.jointPlacements[k].translation for k in robot.model.children[frame.parentJoint]]
+            places = np.vstack([points, np.zeros(3), *carried])
+            lower, upper = places.min(axis=0), places.max(axis=0)
+            outside = float(np.linalg.norm(center - np.clip(center, lower, upper)))
+            box = float(np.linalg.norm(upper - lower))
             if outside > OUTSIDE_RATIO * box:
-                far = f"link {name!r} has its centre of mass {outside:.3g} m outside of its shapes"
-                yield "away", name, f"{far}, which span {box:.2g} m; is it given in the link's frame?"
-        if SIZE_RATIO * size < length:
-            against = f"and its body reaches {size:.2g} m from its centre of mass"
-        # A ball has the least inertia of all bodies of a given mass and density.
-        radius = (3.0 * mass / (4.0 * np.pi * DENSITY)) ** (1.0 / 3.0)
-        gyration = float(np.sqrt(link.moments[-1] / mass))
-        odd = f"{name} has an implausibly {{}} inertia: {{}}"
-        if link.moments.sum() < 1.2 * mass * radius**2:
-            moments = ", ".join(f"{moment:.3g}" for moment in link.moments)
-            dense = f"{mass:g} kg with principal moments {moments} kg m^2 would be denser than osmium"
-            yield "small", link.name, odd.format("small", dense)
-        elif gyration > min(length, SIZE_RATIO * size):
-            yield "large", link.name, odd.format("large", f"its radius of gyration is {gyration:.3g} m, {against}")
+                span_of_shapes = f"which span {box:.2g} m; is it given in the link's frame?"
+                yield "away", link.name, f"{where} {outside:.3g} m outside of its shapes, {span_of_shapes}"
+        reaches = f"and its body reaches {size:.2g} m from its centre of mass"
+        yield from _odd_inertia(link, min(length, SIZE_RATIO * size), reaches if SIZE_RATIO * size < length else span)
 
 
-def _joint_origins(robot: Robot, joint: int) -> Iterator[Floats]:
-    """Origins (3,) of a joint and of those that it carries, in its frame [m]."""
-    yield np.zeros(3)
-    for child, parent in enumerate(robot.model.parents):
-        if child and parent == joint:
-            yield robot.model.jointPlacements[child].translation
-
-
-def _outside(points: Floats, center: Floats) -> tuple[float, float]:
-    """Distance of a point from the box around points (n, 3), 0 inside, and the box's diagonal [m]."""
-    lower, upper = points.min(axis=0), points.max(axis=0)
-    nearest = np.clip(center, lower, upper)
-    return float(np.linalg.norm(center - nearest)), float(np.linalg.norm(upper - lower))
+def _odd_inertia(link: LinkReport, largest: float, against: str) -> Iterator[tuple[str, str, str]]:
+    """An inertia that is too small for the mass, or whose radius of gyration is beyond the largest [m]."""
+    odd, mass = f"link {link.name!r} has an implausibly {{}} inertia: {{}}", link.mass
+    # A ball has the least inertia of all bodies of a given mass and density.
+    radius = (3.0 * mass / (4.0 * np.pi * DENSITY)) ** (1.0 / 3.0)
+    gyration = float(np.sqrt(link.moments[-1] / mass))
+    if link.moments.sum() < 1.2 * mass * radius**2:
+        moments = ", ".join(f"{moment:.3g}" for moment in link.moments)
+        dense = f"{mass:g} kg with principal moments {moments} kg m^2 would be denser than osmium"
+        yield "small", link.name, odd.format("small", dense)
+    elif gyration > largest:
+        yield "large", link.name, odd.format("large", f"its radius of gyration is {gyration:.3g} m, {against}")
 
 
 def _mesh_warnings(robot: Robot, shapes: pin.GeometryModel) -> Iterator[str]:
