@@ -247,16 +247,6 @@ def inspect_robot(
         raise RobotError(f"robot {robot.name!r} cannot be inspected: its mass matrix is not finite")
     condition = _condition_number(M)
     links = _links(robot)
-    shapes, unread = readable_geometry(robot) if flag("meshes", meshes) else (pin.GeometryModel(), {})
-    warnings = [
-        *(*robot.faults, *robot.remarks, *robot.notes, *robot.limit_remarks()),
-        *one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links, shapes))),
-        *_mesh_warnings(robot, shapes),
-        *dict.fromkeys(what for _, what in unread.values()),
-        *_matrix_warnings(robot, condition),
-        *one_of_each(_limit_warnings(robot, configuration)),
-        *_unused(robot),
-    ]
     return RobotReport(
         robot=robot,
         joints=_joints(robot),
@@ -266,8 +256,19 @@ def inspect_robot(
         total_mass=float(robot.tree.mass.sum()),
         q=configuration,
         condition=condition,
-        warnings=tuple(warnings),
+        warnings=tuple(_warnings(robot, links, configuration, condition, meshes=flag("meshes", meshes))),
     )
+
+
+def _warnings(robot: Robot, links: Sequence[LinkReport], q: Floats, condition: float, *, meshes: bool) -> Iterator[str]:
+    yield from (*robot.faults, *robot.remarks, *robot.notes, *robot.limit_remarks())
+    shapes, unread = readable_geometry(robot) if meshes else (pin.GeometryModel(), {})
+    yield from one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links, shapes)))
+    yield from _mesh_warnings(robot, shapes)
+    yield from dict.fromkeys(what for _, what in unread.values())
+    yield from _matrix_warnings(robot, condition)
+    yield from one_of_each(_limit_warnings(robot, q))
+    yield from _unused(robot)
 
 
 def _condition_number(M: Floats) -> float:

@@ -24,6 +24,7 @@ _KINDS = {"position": "vector3", "scale": "vector3", "quaternion": "quaternion",
 
 def draw(viewer: meshcat.Visualizer, stage: Stage) -> None:
     """Send everything to a viewer."""
+    _set_surroundings(viewer, stage.points, stage.figures[0])
     set_view(viewer, stage.points, stage.figures[0])
     clips: dict[meshcat.path.Path, AnimationClip] = {}
     for item in stage.items():
@@ -42,42 +43,38 @@ def draw(viewer: meshcat.Visualizer, stage: Stage) -> None:
         viewer.set_animation(Animation(clips), play=True, repetitions=math.inf)
 
 
-def set_view(viewer: meshcat.Visualizer, points: Floats, figure: Figure, *, camera: bool = True) -> None:
-    """Set the camera so that it sees points (P, 3) [m], the grid at z = 0, axes and background.
-
-    With ``camera=False`` the present camera is moved.
-    """
-    toward = figure.toward
-    axes = np.array([figure.right, figure.up, toward])
+def _framing(points: Floats, figure: Figure) -> tuple[Floats, float]:
+    """The middle (3,) of points (P, 3) [m], and the distance from which the camera sees them all [m]."""
+    axes = np.array([figure.right, figure.up, figure.toward])
     seen = points @ axes.T
     middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0))
     width, up, depth = (seen - middle).T
     tangent = math.tan(0.5 * _VERTICAL_VIEW)
     distance = _MARGIN * float(np.max(depth + np.maximum(np.abs(width) / (_ASPECT * tangent), np.abs(up) / tangent)))
-    distance = distance or figure.size
+    return middle @ axes, distance or figure.size
 
-    # meshcat's camera turns about the origin only, so the middle of the motion is moved there.
-    shift = -(middle @ axes)
-    viewer.set_transform(transform(shift))
-    offset = distance * toward
-    if camera:
-        lens = {
-            "fov": math.degrees(_VERTICAL_VIEW),
-            "aspect": _ASPECT,
-            "near": 0.01 * distance,
-            "far": 100.0 * distance,
-        }
-        viewer["/Cameras/default/rotated"].set_object(meshcat.geometry.PerspectiveCamera(**lens))
+
+def set_view(viewer: meshcat.Visualizer, points: Floats, figure: Figure) -> None:
+    """Move the camera so that it sees points (P, 3) [m]."""
+    middle, distance = _framing(points, figure)
     # That node turns three.js's upward y into the world's z.
-    viewer["/Cameras/default/rotated/<object>"].set_property("position", [offset[0], offset[2], -offset[1]])
+    x, y, z = distance * figure.toward
+    viewer["/Cameras/default/rotated/<object>"].set_property("position", [x, z, -y])
+    # meshcat's camera turns about the origin only, so the middle of the motion is moved there.
+    viewer.set_transform(transform(-middle))
+    for name in ("/Grid", "/Axes"):
+        viewer[name].set_property("position", (-middle).tolist())
 
-    cell = _round_number(figure.size / 8.0)
-    scale = [cell / _GRID_CELL] * 3
+
+def _set_surroundings(viewer: meshcat.Visualizer, points: Floats, figure: Figure) -> None:
+    """Set the camera's lens, the grid at z = 0, axes and background."""
+    _, distance = _framing(points, figure)
+    lens = {"fov": math.degrees(_VERTICAL_VIEW), "near": 0.01 * distance, "far": 100.0 * distance}
+    viewer["/Cameras/default/rotated"].set_object(meshcat.geometry.PerspectiveCamera(aspect=_ASPECT, **lens))
+    scale = [_round_number(figure.size / 8.0) / _GRID_CELL] * 3
+    for name in ("/Grid", "/Axes"):
+        viewer[name].set_property("scale", scale)
     viewer["/Grid"].set_property("color", [1.0, 1.0, 1.0, 0.3])
-    viewer["/Grid"].set_property("scale", scale)
-    viewer["/Grid"].set_property("position", shift.tolist())
-    viewer["/Axes"].set_property("scale", scale)
-    viewer["/Axes"].set_property("position", shift.tolist())
     viewer["/Background"].set_property("top_color", [0.97, 0.98, 1.0])
     viewer["/Background"].set_property("bottom_color", [0.72, 0.77, 0.83])
 

@@ -255,7 +255,7 @@ class LiveView:
         # Twice as far as necessary, so that the camera does not move with every picture.
         out = points + np.where(points > high, points - high, 0.0) - np.where(points < low, low - points, 0.0)
         self._in_view = np.concatenate([self._in_view, points, out])
-        set_view(self._viewer, self._in_view, self._stage.figures[0], camera=False)
+        set_view(self._viewer, self._in_view, self._stage.figures[0])
 
     def _draw_path(self, q: Floats) -> None:
         """Extend the paths of the traced frames over configurations (k, n)."""

@@ -43,32 +43,7 @@ class Stage:
     def of(cls, shown: Sequence[Shown], speed: float = 1.0, fps: float = 1.0) -> Stage:
         """The robots side by side with their marks, as a camera sees them that shows all."""
         times = keyframe_times(shown, fps / speed)
-        robots = [one.robot for one in shown]
-        pictures = {id(robot): Picture.of(robot) for robot in robots}
-        rows = [{name: rows_at(times, *motion) for name, motion in one.motions.items()} for one in shown]
-        swept, axes = [], []
-        for robot, motions in zip(robots, rows, strict=True):
-            q = np.concatenate([*map(samples, motions.values())])
-            swept.append(pictures[id(robot)].swept(q))
-            axes.append(pictures[id(robot)].body_poses(q)[0][..., 2].reshape(-1, 3))
-        size = max(float(np.ptp(points, axis=0).max()) for points in swept) or 1.0
-        toward = view_direction(np.concatenate(axes))
-        figures = [
-            Figure(
-                one,
-                pictures[id(one.robot)],
-                number=f" {k + 1}" if k else "",
-                trace=frame_names("trace", robots, one.marks.trace)[k],
-                frames=frame_names("frames", robots, one.marks.frames)[k],
-                times=times,
-                rows=rows[k],
-                effort=one.effort(times),
-                swept=swept[k],
-                size=size,
-                toward=toward,
-            )
-            for k, one in enumerate(shown)
-        ]
+        figures = _figures(shown, times)
         marks = [list(marks_of(figure)) for figure in figures]
         extents = [_extent(figure, own) for figure, own in zip(figures, marks, strict=True)]
         places = side_by_side(extents, figures[0].right)
@@ -90,6 +65,35 @@ class Stage:
     def title(self) -> str:
         """The names of the robots."""
         return ", ".join(dict.fromkeys(figure.robot.name for figure in self.figures))
+
+
+def _figures(shown: Sequence[Shown], times: Floats) -> list[Figure]:
+    """The robots at the keyframes (K,) [s]."""
+    robots = [one.robot for one in shown]
+    found = {id(robot): Picture.of(robot) for robot in robots}
+    pictures = [found[id(robot)] for robot in robots]
+    rows = [{name: rows_at(times, *motion) for name, motion in one.motions.items()} for one in shown]
+    seen = [np.concatenate([*map(samples, motions.values())]) for motions in rows]
+    swept = [picture.swept(q) for picture, q in zip(pictures, seen, strict=True)]
+    axes = [picture.body_poses(q)[0][..., 2].reshape(-1, 3) for picture, q in zip(pictures, seen, strict=True)]
+    size = max(float(np.ptp(points, axis=0).max()) for points in swept) or 1.0
+    toward = view_direction(np.concatenate(axes))
+    return [
+        Figure(
+            one,
+            pictures[k],
+            number=f" {k + 1}" if k else "",
+            trace=frame_names("trace", robots, one.marks.trace)[k],
+            frames=frame_names("frames", robots, one.marks.frames)[k],
+            times=times,
+            rows=rows[k],
+            effort=one.effort(times),
+            swept=swept[k],
+            size=size,
+            toward=toward,
+        )
+        for k, one in enumerate(shown)
+    ]
 
 
 def joint_items(figure: Figure, kind: str) -> Iterator[Item]:
