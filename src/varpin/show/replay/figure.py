@@ -68,19 +68,19 @@ class Shown:
         return motions
 
     @cached_property
-    def targets(self) -> dict[str, tuple[Floats, Floats | None]]:
-        """Positions (K, 3) [m] of each target and, for poses, quaternions (K, 4); one row if it is fixed."""
-        given, single = self.marks.targets, self.t[-1] == 0.0
+    def targets(self) -> dict[str, tuple[Floats, Floats, Floats | None]]:
+        """Times from 0 [s], positions (K, 3) [m] and, for poses, quaternions (K, 4) of targets; one row if fixed."""
+        given = self.marks.targets
         if given is not None and not isinstance(given, Mapping):
             raise InputError(
                 f"targets must map names to places or poses, as in {{'cup': [0.5, 0, 0.3]}}, got {given!r}"
             )
-        return {str(name): _target(f"targets[{name!r}]", value, single) for name, value in (given or {}).items()}
+        return {str(name): _target(f"targets[{name!r}]", value, self.t[-1]) for name, value in (given or {}).items()}
 
     def times(self) -> list[Floats]:
         """The times of everything that moves [s]: the robot, its ghost, its targets."""
-        targets = [np.linspace(0.0, self.t[-1], len(places)) for places, _ in self.targets.values()]
-        return [*(t for t, _ in self.motions.values()), *(t for t in targets if len(t) > 1)]
+        moving: list[tuple[Any, ...]] = [*self.motions.values(), *self.targets.values()]
+        return [t for t, *_ in moving if len(t) > 1]
 
     def effort(self, times: Floats) -> Floats | None:
         """Torque of each joint of the tree as a share of its limit (K, b), in [0, 1]; None if torques are not shown.
@@ -182,21 +182,21 @@ def read_motion(
         raise InputError(f"{name} must have shape {rows.format(robot.dof)}, got {q.shape}")
     require_finite(name, q)
     if end is not None:
-        _require_one(f"its {name}", q, end == 0.0)
-        return np.linspace(0.0, end, len(q)), q
+        return _spread(f"its {name}", q, end), q
     if dt is None:
         raise InputError("an array of configurations needs dt, the time between its rows [s]")
     return np.arange(len(q), dtype=np.float64) * positive("dt", dt, "s"), q
 
 
-def _require_one(name: str, rows: Floats, single: bool) -> None:
-    """Refuse several rows beside a single pose."""
-    if single and len(rows) > 1:
+def _spread(name: str, rows: Floats, end: float) -> Floats:
+    """Times of rows that are spread evenly over a motion [s]."""
+    if end == 0.0 and len(rows) > 1:
         raise InputError(f"the motion is a single pose, so {name} must be one row, too, got {len(rows)}")
+    return np.linspace(0.0, end, len(rows))
 
 
-def _target(name: str, value: Any, single: bool) -> tuple[Floats, Floats | None]:
-    """Positions (K, 3) [m] and, for poses, quaternions (K, 4); ``single`` is whether the motion is a pose."""
+def _target(name: str, value: Any, end: float) -> tuple[Floats, Floats, Floats | None]:
+    """Times up to an ``end`` [s], positions (K, 3) [m] and, for poses, quaternions (K, 4)."""
     array = require_finite(name, as_floats(name, value))
     array = array[None] if array.shape in ((3,), (4, 4)) else array
     if not len(array) or array.shape[1:] not in ((3,), (4, 4)):
@@ -204,14 +204,14 @@ def _target(name: str, value: Any, single: bool) -> tuple[Floats, Floats | None]
             f"{name} must be a point (3,), a pose (4, 4) or pin.SE3, or rows of them, (K, 3) or (K, 4, 4); got shape "
             f"{array.shape}"
         )
-    _require_one(name, array, single)
+    times = _spread(name, array, end)
     if array.ndim == 2:
-        return array, None
+        return times, array, None
     R = array[:, :3, :3]
     rigid = np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max() < 1e-6 and (np.linalg.det(R) > 0.0).all()
     if not rigid or np.abs(array[:, 3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-9:
         raise InputError(f"{name} must be a pose: a rotation and a position above the row 0 0 0 1")
-    return array[:, :3, 3], Rotation.from_matrix(R).as_quat()
+    return times, array[:, :3, 3], Rotation.from_matrix(R).as_quat()
 
 
 def _controls(robot: Robot, motion: object) -> Floats:

@@ -76,10 +76,7 @@ def marks_of(figure: Figure) -> Iterator[Mark]:
         yield from (tie for constraint in scene.constraints for tie in _ties(figure, constraint))
     yield from _regions(figure, wanted, begin)
     yield from _targets(figure)
-    standing = [places[-1] for places, _ in shown.targets.values()]
-    for frame, goal in _goals(wanted):
-        if not any(np.allclose(place, goal, atol=1e-9) for place in standing):
-            yield _target(figure, f"goal of {frame}", goal[None])
+    yield from _goals(figure, wanted)
 
 
 def _paths(figure: Figure, kind: str, t: Floats, q: Floats) -> Iterator[Mark]:
@@ -152,11 +149,9 @@ def _distinct(points: Floats) -> list[int]:
 
 def _targets(figure: Figure) -> Iterator[Mark]:
     """Targets, which stand or move up to the end of the robot's motion."""
-    end = figure.shown.t[-1]
-    times = np.minimum(figure.times, end)
-    for name, (places, turns) in figure.shown.targets.items():
+    times = np.minimum(figure.times, figure.shown.t[-1])
+    for name, (t, places, turns) in figure.shown.targets.items():
         if len(places) > 1:
-            t = np.linspace(0.0, end, len(places))
             between = None if turns is None else Slerp(t, Rotation.from_quat(turns))(times).as_quat()
             yield _target(figure, name, rows_at(times, t, places), between)
         else:
@@ -310,10 +305,14 @@ def _open_box(figure: Figure, name: str, limits: Floats, place: Floats, axes: Fl
     return Mark("in", name, place + corners, [shapes.Item("", form, pose)])
 
 
-def _goals(constraints: Sequence[PlanConstraint]) -> list[tuple[str, Floats]]:
-    """Frames with final positions (3,) [m]."""
+def _goals(figure: Figure, constraints: Sequence[PlanConstraint]) -> Iterator[Mark]:
+    """Final positions of frames, but for those where a target ends."""
     if not constraints:
-        return []
+        return
     from varpin.control.constraints import ReachFrame  # noqa: PLC0415 - as above
 
-    return [(c.frame, c.position) for c in constraints if isinstance(c, ReachFrame) and c.position is not None]
+    ends = [places[-1] for _, places, _ in figure.shown.targets.values()]
+    goals = [(c.frame, c.position) for c in constraints if isinstance(c, ReachFrame) and c.position is not None]
+    for frame, goal in goals:
+        if not any(np.allclose(place, goal, atol=1e-9) for place in ends):
+            yield _target(figure, f"goal of {frame}", goal[None])

@@ -32,7 +32,8 @@ _PACKAGES = {"imageio": "imageio", "imageio_ffmpeg": "imageio-ffmpeg", "selenium
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 _DRIVER = "chromedriver"
 
-# Software rendering gives the same pictures everywhere. Containers allow no sandbox, and the page is varpin's own.
+# Beside the driver's own. Software rendering gives the same pictures everywhere. Containers allow no sandbox, and the
+# page is varpin's own.
 _FLAGS = (
     "--headless",
     "--no-sandbox",
@@ -40,11 +41,7 @@ _FLAGS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--disable-dev-shm-usage",
-    "--disable-background-networking",
     "--disable-component-update",
-    "--disable-sync",
-    "--no-first-run",
-    "--hide-scrollbars",
 )
 
 _LOAD_LIMIT = 120.0  # time limit for a page to load [s]
