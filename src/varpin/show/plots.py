@@ -39,6 +39,14 @@ DASHES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)), (0, (9
 _LIMITS, _NEAR = "limits", 0.3
 # Rows of a column of the legend.
 _LEGEND_ROWS = 20
+# Units of quantities, of a revolute and of a prismatic joint.
+_UNITS = {
+    "position": ("rad", "m"),
+    "commanded position": ("rad", "m"),
+    "estimated error": ("rad", "m"),
+    "velocity": ("rad/s", "m/s"),
+    "control": ("N m", "N"),
+}
 # Width of a line of a motion, in points.
 _WIDTH = 1.4
 # Look of a line that marks a value.
@@ -71,14 +79,14 @@ def plot_joints(trajectory: Motion, axes: Axes | None = None, *, robot: Robot | 
     """
     trajectory = _require_motion(trajectory, robot)
     limits = None if robot is None else robot.position_limits
-    return _draw(trajectory, trajectory.q, _of_joints(trajectory, robot, "position", ("rad", "m")), axes, limits)
+    return _draw(trajectory, trajectory.q, _of_joints(trajectory, robot, "position"), axes, limits)
 
 
 def plot_velocities(trajectory: Motion, axes: Axes | None = None, *, robot: Robot | None = None) -> Drawn:
     """Joint velocities over time; arguments as for :func:`plot_joints`."""
     trajectory = _require_motion(trajectory, robot)
     limits = None if robot is None else (-robot.velocity_limit, robot.velocity_limit)
-    return _draw(trajectory, trajectory.v, _of_joints(trajectory, robot, "velocity", ("rad/s", "m/s")), axes, limits)
+    return _draw(trajectory, trajectory.v, _of_joints(trajectory, robot, "velocity"), axes, limits)
 
 
 def plot_error(trajectory: Motion, axes: Axes | None = None, *, robot: Robot | None = None) -> Drawn:
@@ -86,7 +94,7 @@ def plot_error(trajectory: Motion, axes: Axes | None = None, *, robot: Robot | N
     trajectory = _require_motion(trajectory, robot)
     if trajectory.error is None:
         raise InputError("the motion has no error: it was simulated with check=False")
-    lines = _of_joints(trajectory, robot, "estimated error", ("rad", "m"))
+    lines = _of_joints(trajectory, robot, "estimated error")
     figure, axes = _draw(trajectory, trajectory.error, lines, axes)
     if trajectory.error.any():
         # The error is zero at the start.
@@ -272,8 +280,9 @@ def _draw(
     return figure, axes
 
 
-def _of_joints(trajectory: Trajectory, robot: Robot | None, what: str, units: tuple[str, str]) -> list[Line]:
-    """A line for each joint; ``units`` are those of a revolute and of a prismatic joint."""
+def _of_joints(trajectory: Trajectory, robot: Robot | None, what: str) -> list[Line]:
+    """A line of a quantity for each joint."""
+    units = _UNITS[what]
     slides = [None] * len(trajectory.joint_names) if robot is None else robot.slides.tolist()
     return [
         Line(name, what, " or ".join(units) if slide is None else units[int(slide)])
@@ -283,14 +292,8 @@ def _of_joints(trajectory: Trajectory, robot: Robot | None, what: str, units: tu
 
 def _of_controls(trajectory: Trajectory, robot: Robot | None) -> tuple[list[Line], list[int]]:
     """A line for each control (m,), and the joint that it acts on alone, or -1."""
-    forces, positions, rates = (
-        _of_joints(trajectory, robot, what, units)
-        for what, units in (
-            ("control", ("N m", "N")),
-            ("commanded position", ("rad", "m")),
-            ("velocity", ("rad/s", "m/s")),
-        )
-    )
+    kinds = "control", "commanded position", "velocity"
+    forces, positions, rates = (_of_joints(trajectory, robot, kind) for kind in kinds)
     lines = [Line(f"u{k + 1}", "control", "N m or N") for k in range(trajectory.u.shape[1])]
     joints = [-1] * len(lines)
     actuation = trajectory.scene_values.get("actuation", np.zeros((0, 0)))

@@ -70,22 +70,17 @@ class Picture:
         poses = [links(tree, j).core.place_frame(np.eye(3), np.zeros(3), q, False)[:2] for j in range(len(tree.parent))]
         return np.stack([R for R, _ in poses], axis=1), np.stack([p for _, p in poses], axis=1)
 
-    def corners(self, body: int) -> Floats:
-        """Corners (k, 3) of the boxes around the shapes on a body, in its frame [m]."""
-        boxes = [np.empty((0, 3))]
-        for form, _, on, placement in self.shapes:
-            if on == body:
-                form.geometry.computeLocalAABB()
-                box = np.array([form.geometry.aabb_local.min_, form.geometry.aabb_local.max_])
-                boxes.append(corners_of(box) @ placement.rotation.T + placement.translation)
-        return np.concatenate(boxes)
-
     def swept(self, q: Floats) -> Floats:
         """Points (k, 3) [m] of the world around all shapes at configurations (S, n)."""
         R, p = self.body_poses(q)
-        points = [self.corners(-1), p.reshape(-1, 3)]
-        for j in range(R.shape[1]):
-            points.append((self.corners(j) @ R[:, j].transpose(0, 2, 1) + p[:, j, None]).reshape(-1, 3))
+        points = [p.reshape(-1, 3)]
+        for form, _, body, placement in self.shapes:
+            form.geometry.computeLocalAABB()
+            box = np.array([form.geometry.aabb_local.min_, form.geometry.aabb_local.max_])
+            corners = corners_of(box) @ placement.rotation.T + placement.translation
+            if body >= 0:
+                corners = (corners @ R[:, body].transpose(0, 2, 1) + p[:, body, None]).reshape(-1, 3)
+            points.append(corners)
         return np.concatenate(points)
 
 
