@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+import pinocchio as pin
 
 from varpin.arrays import Floats
 from varpin.show.given import frame_names, motion_of
@@ -102,12 +102,9 @@ def joint_items(figure: Figure, kind: str) -> Iterator[Item]:
     # Positions of all joints of the tree, mimic joints included.
     positions = q[:, tree.coordinate] * tree.ratio + tree.offset
     for j, slides in enumerate(tree.prismatic):
-        node, (c, s) = figure.node(kind, j), (math.cos(positions[0, j]), math.sin(positions[0, j]))
+        node, along = figure.node(kind, j), np.array([0.0, 0.0, positions[0, j]])
         yield Item(node.removesuffix("/moving"), pose=transform(tree.translation[j], tree.rotation[j]))
-        if slides:
-            pose = transform(np.array([0.0, 0.0, positions[0, j]]))
-        else:
-            pose = transform(np.zeros(3), np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
+        pose = transform(along) if slides else transform(np.zeros(3), pin.exp3(along))
         # One number, so that the page interpolates in q and links stay rigid at any frame rate.
         yield Item(node, pose=pose, tracks={"position[z]" if slides else "rotation[z]": positions[:, j]})
 
