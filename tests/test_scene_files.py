@@ -442,7 +442,7 @@ def test_odd_values_anywhere_are_taken_or_refused_in_words(tmp_path, monkeypatch
 
 
 def target_of(file):
-    return file._task.terms[0].target
+    return file.problem.cost.terms[0].reference
 
 
 def test_an_option_of_solve_is_refused_with_its_key(tmp_path):

@@ -73,6 +73,7 @@ COSTS: Mapping[str, Callable[..., Cost]] = {
     "joint_limits": costs.JointLimitBarrier,
     "velocity_limits": costs.VelocityLimitBarrier,
 }
+COST_WORDS = {kind: word for word, kind in COSTS.items()}
 # Costs whose components are joints, or controls; and names of the components of others: weights, and targets.
 OF_JOINTS = ("tracking", "velocity", "joint_limits", "velocity_limits")
 OF_CONTROLS = ("control", "control_rate")

@@ -12,7 +12,7 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control import OptimalControlProblem, Solution, solve
-from varpin.control.costs import CostError
+from varpin.control.costs import CostError, CostSum
 from varpin.errors import InputError
 from varpin.integrators import Integrator
 from varpin.io.scenefile import kinds
@@ -100,13 +100,12 @@ class SceneFile:
         task = self._task
         if not task.tables.get("cost"):
             raise task.where.at("cost").error("is missing; a scene to solve needs at least one [[cost]]")
-        task.require_start()
         horizon = {key: value for key, value in task.tables["horizon"].items() if key != "duration"}
         options = horizon | {"dt": self.dt, "steps": self.steps, "integrator": self.integrator}
         options |= {"control_limits": (-task.control_limit, task.control_limit)}
         options |= {"constraints": task.plan_constraints()}
         try:
-            return OptimalControlProblem(task.scene, task.cost(), task.q0, task.v0, **options)
+            return OptimalControlProblem(task.scene, CostSum(task.costs), task.q0, task.v0, **options)
         except (CostError, InputError) as error:
             about = error.argument if isinstance(error, InputError) else None
             if about is None and any(key in str(error) for key in horizon):
@@ -193,7 +192,7 @@ class SceneFile:
             duration: Duration of the motion [s]; the horizon if left out.
         """
         constraints = self.problem if self._task.tables.get("plan_constraint") else self.scene
-        return marks_of(self._task, self.steps * self.dt if duration is None else duration, constraints)
+        return marks_of(self._task.costs, self.q0, self.steps * self.dt if duration is None else duration, constraints)
 
     def load_solution(self, path: str | Path) -> Solution:
         """Read a solution of this scene that :meth:`Solution.save` wrote; see :meth:`Solution.load`."""
