@@ -66,7 +66,7 @@ def test_pareto_front_is_what_nothing_beats(oscillator):
         for run in oscillator.runs:
             beaten = any(
                 other.seconds < run.seconds
-                and oscillator.error_of(other, quantity) < oscillator.error_of(run, quantity)
+                and oscillator.value_of(other, quantity) < oscillator.value_of(run, quantity)
                 for other in oscillator.runs
             )
             assert (run in chosen) != beaten
@@ -80,7 +80,7 @@ def test_errors_below_the_references_own_are_flagged():
     coarse, fine = record.runs
     assert not record.at_floor(coarse)
     assert record.at_floor(fine)
-    assert record.error_of(fine) == record.reference_error > 0.0
+    assert record.value_of(fine) == record.reference_error > 0.0
     at = record.columns().index("error in q [rad or m]")
     assert record.row(fine)[at] == f"<{record.reference_error:.3g}"
     assert record.row(coarse)[at] == f"{coarse.error:.3g}"

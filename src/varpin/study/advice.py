@@ -86,7 +86,7 @@ class Advice(Study[Choice]):
         """Whether a choice was measured."""
         return "" if run.measured else "extrapolated"
 
-    def pareto(self) -> tuple[Choice, ...]:
+    def pareto(self, quantity: str = "") -> tuple[Choice, ...]:  # noqa: ARG002
         """The choice, if it meets the wish."""
         return (self.best,) if self.reached else ()
 

@@ -139,10 +139,6 @@ class Record(Study[Cell]):
         """The failed checks."""
         return "; ".join(run.found)
 
-    def pareto(self) -> tuple[Cell, ...]:
-        """None: accuracy is not set against time here."""
-        return ()
-
     def counts(self) -> dict[Kind, int]:
         """How many motions there are of each kind."""
         return {kind: sum(cell.kind is kind for cell in self.runs) for kind in Kind}
