@@ -60,7 +60,7 @@ PLAN_CONSTRAINTS: Mapping[str, Callable[..., plan.PlanConstraint]] = {
 OBSTACLES: Mapping[str, Callable[..., Obstacle]] = {
     name: getattr(Obstacle, name) for name in ("sphere", "capsule", "box", "convex", "mesh")
 }
-COSTS: Mapping[str, Callable[..., Cost]] = {
+COSTS: Mapping[str, type[Cost]] = {
     "tracking": costs.TrackingCost,
     "velocity": costs.VelocityCost,
     "control": costs.ControlCost,

@@ -93,11 +93,18 @@ class Where:
                 raise self.at(name).error("is missing")
         return given
 
-    def tables(self, given: Any) -> list[tuple[Where, Any]]:
-        """The tables of a list, each with its place."""
-        if not isinstance(given, list):
-            raise self.error(f"must be a list of tables, written [[{self.key}]], got {_shown(given)}")
-        return [(self.at(index), entry) for index, entry in enumerate(given)]
+    def tables(self, given: Mapping[str, Any], name: str) -> list[tuple[Where, Any]]:
+        """The tables of a list under a key, each with its place; none where the key is left out."""
+        at, found = self.at(name), given.get(name, [])
+        if not isinstance(found, list):
+            raise at.error(f"must be a list of tables, written [[{at.key}]], got {_shown(found)}")
+        return [(at.at(index), entry) for index, entry in enumerate(found)]
+
+    def kinds(
+        self, given: Mapping[str, Any], name: str, kinds: Mapping[str, _T]
+    ) -> list[tuple[Where, str, _T, dict[str, Any]]]:
+        """The tables of a list under a key: the place of each, and what :meth:`kind` tells of it."""
+        return [(place, *place.kind(entry, kinds)) for place, entry in self.tables(given, name)]
 
     def call(self, make: Callable[..., _T], given: Any, without: Collection[str] = (), **others: Any) -> _T:
         """What a function of the API makes of the keys of a table and of ``others``; ``without`` are none."""

@@ -87,7 +87,7 @@ def _sines(reader: Reader, sines: Any = None, offset: Any = 0.0) -> Timeline:
     """Sines about an offset."""
     where, names, found = reader.where, list(reader.names), []
     values = where.at("offset").numbers(offset, names, reader.what)
-    for place, table in where.at("sines").tables([] if sines is None else sines):
+    for place, table in where.tables({} if sines is None else {"sines": sines}, "sines"):
         of, amplitude, frequency, phase = place.call(_sine, table)
         place.at("of").one_of(of, names)
         if frequency > 0.5 / reader.dt:

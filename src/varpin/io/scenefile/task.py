@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -80,10 +80,10 @@ class Task:
 
     def complete(self) -> Task:
         """The task with its costs and controls."""
-        given = self.where.at("cost").tables(self.tables.get("cost", []))
+        given = self.where.kinds(self.tables, "cost", kinds.COSTS)
         if given:
             self.require_start()
-        found = [_cost(where, cost, self) for where, cost in given]
+        found = [_cost(self, *each) for each in given]
         return replace(self, costs=tuple(cost for cost in found if cost is not None), controls=_controls(self))
 
     def reader(self, where: Where, names: Sequence[str], what: str) -> Reader:
@@ -136,13 +136,13 @@ class Task:
     def plan_constraints(self) -> list[PlanConstraint]:
         """The constraints of a plan."""
         found, robot = [], self.scene.robot
-        for where, given in self.where.at("plan_constraint").tables(self.tables.get("plan_constraint", [])):
-            word, kind, own = where.kind(given, kinds.PLAN_CONSTRAINTS)
+        for where, word, kind, own in self.where.kinds(self.tables, "plan_constraint", kinds.PLAN_CONSTRAINTS):
             others: dict[str, Any] = {} if word == "control_rate" else {"robot": robot}
             if word == "clearance":
-                bodies = where.at("obstacles").tables(own.pop("obstacles", []))
+                bodies = where.kinds({"obstacles": own.pop("obstacles", [])}, "obstacles", kinds.OBSTACLES)
                 others |= {"obstacles": [_obstacle(*body) for body in bodies], "capsules": None}
-                own |= {"srdf": where.at("srdf").file(own["srdf"])} if "srdf" in own else {}
+                if "srdf" in own:
+                    own["srdf"] = where.at("srdf").file(own["srdf"])
             elif word.endswith("_limits") and own.keys() & {"lower", "upper"}:
                 others["limits"] = own.pop("lower", -np.inf), own.pop("upper", np.inf)
             elif "rotation" in own:
@@ -152,8 +152,7 @@ class Task:
         return found
 
 
-def _obstacle(where: Where, given: Any) -> Obstacle:
-    word, make, own = where.kind(given, kinds.OBSTACLES)
+def _obstacle(where: Where, word: str, make: Callable[..., Obstacle], own: dict[str, Any]) -> Obstacle:
     if word == "mesh" and "path" in own:
         own["path"] = where.at("path").file(own["path"])
     return where.call(make, own)
@@ -170,7 +169,7 @@ def joints_of_frame(robot: Robot, frame: str) -> Mask:
 
 def required_of(task: Task, *, idle: bool) -> tuple[Task, Required]:
     """The task without idle joints, unless they stay, and the report on it."""
-    scene, kept = task.scene, task.where.at("plan_constraint").tables(task.tables.get("plan_constraint", []))
+    scene, kept = task.scene, task.where.kinds(task.tables, "plan_constraint", kinds.PLAN_CONSTRAINTS)
     out: Mapping[str, float] = {}
     if idle and not (kept or scene.constraints):
         touched = np.any([np.zeros(scene.robot.dof), *(_touched(cost, task) for cost in task.costs)], axis=0)
@@ -184,7 +183,7 @@ def required_of(task: Task, *, idle: bool) -> tuple[Task, Required]:
     part = task.without(list(out))
     told = report(part.scene, scene, out)
     costs = [kinds.COST_WORDS[type(cost)] + (" at the end" if cost.at_end else "") for cost in part.costs]
-    words = dict.fromkeys(place.kind(given, kinds.PLAN_CONSTRAINTS)[0] for place, given in kept)
+    words = dict.fromkeys(word for _, word, *_ in kept)
     terms = {
         **told.terms,
         "torque limits": joints_with(np.isfinite(part.torque_limit), part.driven),
@@ -223,7 +222,7 @@ def task_of(root: Where, tables: dict[str, Any]) -> Task:
     at = root.at("horizon")
     keys = ("dt", "steps", "duration", "hold", "sampling", "controls", "between_nodes")
     horizon = at.table(tables["horizon"], keys, ("dt",))
-    costs = len(root.at("cost").tables(tables.get("cost", [])))
+    costs = len(root.tables(tables, "cost"))
     if ("steps" in horizon) == ("duration" in horizon):
         raise at.error("a horizon has steps, or a duration [s]: give one of them")
     with at.named(horizon):
@@ -231,14 +230,15 @@ def task_of(root: Where, tables: dict[str, Any]) -> Task:
         count("steps", steps, 1)
     if steps * max(1, _PER_COST * costs) > _MOST_STEPS:
         raise at.error(f"{steps} steps are more than {_MOST_STEPS}, or a tenth of that divided by the number of costs")
-    return _on_robot(root, tables, _robot(root.at("robot"), tables["robot"]), dt, steps)
+    return _on_robot(root, tables, _robot(root, tables), dt, steps)
 
 
-def _robot(where: Where, given: Any) -> Robot:
+def _robot(root: Where, tables: Mapping[str, Any]) -> Robot:
     """The robot of a file, or several in one."""
-    if not isinstance(given, list):
-        return _one(where, given)
-    members = [(place, dict(place.table(own))) for place, own in where.tables(given)]
+    where = root.at("robot")
+    if not isinstance(tables["robot"], list):
+        return _one(where, tables["robot"])
+    members = [(place, dict(place.table(own))) for place, own in root.tables(tables, "robot")]
     prefixes = [place.at("prefix").text(own.pop("prefix")) if "prefix" in own else "" for place, own in members]
     robots = [_one(place, own) for place, own in members]
     with where.named():
@@ -258,8 +258,7 @@ def _one(where: Where, given: Any) -> Robot:
     folders = own.get("package_dirs", [])
     if isinstance(folders, list) and folders:
         own["package_dirs"] = [where.at("package_dirs", k).beside(folder) for k, folder in enumerate(folders)]
-    payloads = where.at("payload").tables(own.get("payload", []))
-    own["payload"] = [place.call(Payload, load) for place, load in payloads]
+    own["payload"] = [place.call(Payload, load) for place, load in where.tables(own, "payload")]
     lock = own.get("lock", {})
     for joint, value in lock.items() if isinstance(lock, dict) else ():
         if isinstance(value, int | float):
@@ -291,19 +290,17 @@ def _on_robot(root: Where, tables: Mapping[str, Any], robot: Robot, dt: float, s
     driven, gear, limit = _actuation(root.at("actuation"), tables.get("actuation", {}), robot)
     matrix = np.zeros((robot.dof, len(driven)))
     matrix[[robot.coordinate(joint) for joint in driven], np.arange(len(driven))] = gear
-    constraints: list[Any] = []
-    for where, given in root.at("constraint").tables(tables.get("constraint", [])):
-        _, kind, own = where.kind(given, kinds.CONSTRAINTS)
-        constraints.append(_bound(where, kind, own, robot))
+    own = root.kinds(tables, "constraint", kinds.CONSTRAINTS)
+    constraints = [_bound(where, kind, keys, robot) for where, _, kind, keys in own]
     given = {
         "gravity": tables.get("gravity", True),
         "damping": tables.get("damping"),
         "friction": tables.get("friction"),
         "stiffness": springs.get("stiffness", 0.0),
         "rest": root.at("springs", "rest").positions(springs.get("rest", 0.0), robot),
-        "forces": _forces(root.at("force"), tables.get("force", []), robot, driven, limit),
+        "forces": _forces(root, tables, robot, driven, limit),
         "actuation": matrix,
-        "noise": _noise(root.at("noise"), tables.get("noise", []), robot, driven) or None,
+        "noise": _noise(root, tables, robot, driven) or None,
         "constraints": constraints or None,
     }
     try:
@@ -369,13 +366,12 @@ def _bound(where: Where, kind: Any, own: dict[str, Any], robot: Robot) -> Any:
     return made
 
 
-def _forces(where: Where, given: Any, robot: Robot, driven: Sequence[str], limit: Floats) -> list[Force]:
+def _forces(root: Where, tables: Mapping[str, Any], robot: Robot, driven: Sequence[str], limit: Floats) -> list[Force]:
     """The forces of a file. Torque limits of driven joints bound the effort of servos."""
     most = np.full(robot.dof, np.inf)
     most[[robot.coordinate(joint) for joint in driven]] = limit
     found: list[Force] = []
-    for place, table in where.tables(given):
-        word, kind, own = place.kind(table, kinds.FORCES)
+    for place, word, kind, own in root.kinds(tables, "force", kinds.FORCES):
         if word == "friction" and own.get("level") == "robot":
             own["level"] = robot.friction
         force = _bound(place, kind, own, robot)
@@ -388,11 +384,10 @@ def _forces(where: Where, given: Any, robot: Robot, driven: Sequence[str], limit
     return found
 
 
-def _noise(where: Where, given: Any, robot: Robot, driven: Sequence[str]) -> list[Noise]:
+def _noise(root: Where, tables: Mapping[str, Any], robot: Robot, driven: Sequence[str]) -> list[Noise]:
     """The noise models of a file."""
     found: list[Noise] = []
-    for place, table in where.tables(given):
-        word, kind, own = place.kind(table, kinds.NOISE)
+    for place, word, kind, own in root.kinds(tables, "noise", kinds.NOISE):
         whose, what = (driven, "driven joint") if word == "control" else (robot.joint_names, "joint")
         if "intensity" in own:
             own["intensity"] = place.at("intensity").numbers(own["intensity"], whose, what)
@@ -402,9 +397,8 @@ def _noise(where: Where, given: Any, robot: Robot, driven: Sequence[str]) -> lis
     return found
 
 
-def _cost(where: Where, table: Any, task: Task) -> Cost | None:
+def _cost(task: Task, where: Where, kind: str, make: type[Cost], own: dict[str, Any]) -> Cost | None:
     """A term of the cost; None if it weighs nothing of the task's joints."""
-    kind, make, own = where.kind(table, kinds.COSTS)
     scene, robot, target_key, keys = task.scene, task.robot, kinds.target_key(kind), kinds.cost_keys(kind)
     where.table(own, keys, [key for key, needed in keys.items() if needed])
     names, what = kinds.AXES.get(kind, ("weight",)), "component"
