@@ -28,11 +28,12 @@ def add_outputs(parser: argparse.ArgumentParser, what: str) -> None:
     add_replay_options(add_files(parser, "NPZ", save, "draw an overview, as png, pdf or svg"))
 
 
-def add_files(parser: argparse.ArgumentParser, ending: str, save: str, plot: str) -> argparse._ActionsContainer:
-    """Add ``--save``, ``--plot`` and ``--quiet``; returns their group."""
+def add_files(parser: argparse.ArgumentParser, ending: str, save: str, plot: str = "") -> argparse._ActionsContainer:
+    """Add ``--save``, ``--plot`` if there is a figure, and ``--quiet``; returns their group."""
     outputs = parser.add_argument_group("outputs")
     outputs.add_argument("--save", type=Path, metavar=ending, help=save)
-    outputs.add_argument("--plot", type=Path, metavar="PNG", help=plot)
+    if plot:
+        outputs.add_argument("--plot", type=Path, metavar="PNG", help=plot)
     outputs.add_argument("--quiet", action="store_true", help="print warnings and errors only")
     return outputs
 

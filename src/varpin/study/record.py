@@ -115,12 +115,8 @@ class Study(Generic[Row]):
         return Table(title, self.columns(), [self.row(run) for run in self.runs], strong)
 
     def _repr_html_(self) -> str:
-        return self.html()
-
-    def html(self, **rows: int) -> str:
-        """The runs and what a reader has to know as HTML; ``most=`` runs."""
         runs = self.table()
-        table = markup.table(runs.columns, runs.rows, runs.strong, **rows)
+        table = markup.table(runs.columns, runs.rows, runs.strong)
         return markup.facts(repr(self), [("", note) for note in (*self.notes, *self.failures)], table)
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
