@@ -89,16 +89,7 @@ class SingularMassMatrix(RobotError):
 
 
 class InputError(VarpinError, ValueError):
-    """An argument has a wrong shape, type or value.
-
-    Attributes:
-        argument: Of :class:`varpin.OptimalControlProblem` the argument at fault, ``controls`` or ``constraints[i]``;
-            None elsewhere.
-    """
-
-    def __init__(self, problem: str, argument: str | None = None) -> None:
-        self.argument = argument
-        super().__init__(problem)
+    """An argument has a wrong shape, type or value."""
 
 
 class AssemblyError(InputError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -31,7 +32,7 @@ from varpin.support.checks import count, positive
 from varpin.support.markup import facts
 from varpin.trajectory import Trajectory
 
-_OPTIONS = ("tolerance", "max_iterations", "second_order", "forward", "regularization", "true_cost")
+_OPTIONS = ("tolerance", "max_iterations", "second_order", "regularization", "true_cost")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -107,12 +108,10 @@ class SceneFile:
         try:
             return OptimalControlProblem(task.scene, CostSum(task.costs), task.q0, task.v0, **options)
         except (CostError, InputError) as error:
-            about = error.argument if isinstance(error, InputError) else None
-            if about is None and any(key in str(error) for key in horizon):
-                raise task.where.at("horizon").of(error, horizon) from None
-            key = (about or "cost").replace("constraints[", "plan_constraint[")
-            where = task.where.at("horizon") if key in ("controls", "sampling") else task.where
-            raise where.at(key).error(str(error)) from None
+            if index := re.search(r"constraints(\[\d+\])", " ".join(getattr(error, "__notes__", ()))):
+                raise task.where.at(f"plan_constraint{index[1]}").error(str(error)) from None
+            wrong = task.where.at("horizon").of(error, horizon)
+            raise (task.where.at("cost").error(str(error)) if wrong.key == "horizon" else wrong) from None
 
     def controls(self) -> Floats | None:
         """Controls of a simulation, (N, m) or (m,), or None for none."""
