@@ -47,24 +47,21 @@ _STRUCTURE = ("record", "symplecticity")
 
 
 class Kind(Enum):
-    """The judgement of a motion; the value is its name in texts."""
+    """The judgement of a motion; the value is its name in texts, and ``meaning`` what it says."""
 
-    ACCURATE = "accurate"
-    DEGRADED = "degraded"
-    REFUSED = "refused"
-    STOPPED = "stopped"
-    WRONG = "silent wrong"
+    meaning: str
 
-    @property
-    def meaning(self) -> str:
-        """What it says, in words."""
-        return {
-            Kind.ACCURATE: "every check passes",
-            Kind.DEGRADED: "varpin warns that the result is inaccurate",
-            Kind.REFUSED: "a named error before the first step",
-            Kind.STOPPED: "a named error during the run; the motion up to there is kept",
-            Kind.WRONG: "a check fails, and varpin gives no warning",
-        }[self]
+    ACCURATE = "accurate", "every check passes"
+    DEGRADED = "degraded", "varpin warns that the result is inaccurate"
+    REFUSED = "refused", "a named error before the first step"
+    STOPPED = "stopped", "a named error during the run; the motion up to there is kept"
+    WRONG = "silent wrong", "a check fails, and varpin gives no warning"
+
+    def __new__(cls, word: str, meaning: str) -> Kind:
+        """A judgement by its name and meaning."""
+        kind = object.__new__(cls)
+        kind._value_, kind.meaning = word, meaning
+        return kind
 
 
 @dataclass(frozen=True)

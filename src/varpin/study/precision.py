@@ -13,8 +13,8 @@ from varpin.arrays import Floats
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Gauss, Integrator, Reference
 from varpin.mechanics.scene import Scene, require_scene
-from varpin.simulation.check import repeated
-from varpin.simulation.tolerance import ROUNDING, SENSIBLE, Ladder, Trial, first_steps
+from varpin.signals.commands import held_in_parts
+from varpin.simulation.tolerance import ROUNDING, steps_for_tolerance
 from varpin.study.motion import Setting, integrators_of
 from varpin.study.record import Progress, Study, collect
 from varpin.support.checks import JointValues, count, positive
@@ -27,8 +27,8 @@ _COARSEST, _HALVINGS = 0.04, 8
 _SAMPLES = 64
 # The reference, and the one that tells its error.
 _EXACT, _LOOSER = Reference(rtol=1e-13), Reference(rtol=1e-12)
-# The reference under constraints, which ``Reference`` does not keep, and its most steps.
-_CONSTRAINED, _MOST = Gauss(4), 2**18
+# The reference under constraints, which ``Reference`` does not keep.
+_CONSTRAINED = Gauss(4)
 
 
 @dataclass(frozen=True)
@@ -159,11 +159,11 @@ def work_precision(
     jobs = [(member, steps) for member in members for steps in grids]
     samples = _samples(grids, len(setting.controls))
     if scene.constraints:
-        text, exact, other = f"{_CONSTRAINED} in ever smaller steps", *_constrained(setting, samples)
+        text, exact, error = f"{_CONSTRAINED} in ever smaller steps", *_constrained(setting, samples)
     else:
         # Over short intervals both may take the same steps and agree, exact or not: halved they do not.
-        text, exact, other = str(_EXACT), _by(setting, _EXACT, 2 * samples)[::2], _by(setting, _LOOSER, samples)
-    error = float(np.abs(exact - other).max())
+        text, exact = str(_EXACT), _by(setting, _EXACT, 2 * samples)[::2]
+        error = float(np.abs(exact - _by(setting, _LOOSER, samples)).max())
     base = WorkPrecision((), scene.robot.name, setting.duration, text, error, samples)
     return collect(base, (_measure(setting, exact, repeats, *job) for job in jobs), len(jobs), progress)
 
@@ -176,22 +176,13 @@ def _by(setting: Setting, reference: Reference, samples: int) -> Floats:
     return outcome.motion.q
 
 
-def _constrained(setting: Setting, samples: int) -> tuple[Floats, Floats]:
-    """A motion under constraints (K + 1, n) in steps that leave nothing but rounding, and its repetition."""
-    first = samples * math.ceil(first_steps(setting.scene, setting.q0, setting.v0, setting.duration, 1) / samples)
-    taken = [0]
-
-    def trial(member: Integrator, steps: int) -> Trial:
-        taken.append(steps)
-        return setting.trial(member, steps)
-
-    ladder = Ladder(trial, [_CONSTRAINED], first, samples, lambda: taken[-1] > _MOST)
-    best = ladder.for_tolerance(ROUNDING * max(1.0, float(np.abs(setting.q0).max())))[0][0]
-    if not best.error < SENSIBLE:
-        raise VarpinError("no steps are small enough for a reference of this motion")
-    motion = setting.run(_CONSTRAINED, best.steps).motion
-    stride = best.steps // samples
-    return motion.q[::stride], repeated(setting.scene, _CONSTRAINED, motion)[0][::stride]
+def _constrained(setting: Setting, samples: int) -> tuple[Floats, float]:
+    """A motion under constraints (K + 1, n) in steps that leave nothing but rounding, and its error."""
+    scene, start, parts = setting.scene, (setting.q0, setting.v0), samples // len(setting.controls)
+    rows = held_in_parts(scene, setting.controls, *start, setting.duration * parts / samples, parts)
+    found = steps_for_tolerance(scene, *start, setting.duration, ROUNDING, rows, _CONSTRAINED)
+    motion = setting.run(_CONSTRAINED, found.steps).motion
+    return motion.q[:: found.steps // samples], float(found.error.max())
 
 
 def _grids(setting: Setting, dts: Sequence[float] | None) -> list[int]:
