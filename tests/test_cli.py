@@ -91,7 +91,7 @@ def test_outputs_are_written_and_listed(arm, tmp_path, run):
     assert png.read_bytes().startswith(b"\x89PNG")
     assert b"<html" in html.read_bytes()[:500].lower()
     assert len(re.findall(r"^  written\b", out, re.M)) == 3
-    assert not unnamed(out, "arm: Gauss(stages=2)", "30, 0.01 s each, 0.3 s in all", "energy change")
+    assert not unnamed(out, "arm: Gauss(stages=2)", "30 of 0.01 s, 0.3 s in all", "energy change")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.html", "a.npz", "a.png", "arm.urdf"]
 
 

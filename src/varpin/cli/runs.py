@@ -115,23 +115,9 @@ def _run(
 
 def _summary(trajectory: Trajectory, wall_time: float, written: Iterable[tuple[str, object]]) -> Table:
     """A table of a run: its settings, work, result and files."""
-    steps, statistics, accuracy = trajectory.steps, trajectory.statistics, trajectory.accuracy
-    rows: list[tuple[str, object]] = [
-        ("steps", f"{steps}, {trajectory.dt:g} s each, {trajectory.duration:g} s in all"),
+    rows = [
+        *trajectory.rows,
         ("wall time", f"{wall_time:.3g} s"),
-    ]
-    if accuracy is not None:
-        rows.append(("tolerance", str(accuracy)))
-    elif trajectory.error_text:
-        rows.append(("estimated error in q", f"{trajectory.error_text.removeprefix('error ')} rad or m"))
-    if split := statistics.split_steps:
-        most = statistics.substeps.max()
-        rows.append(("split steps", f"{split} of {steps}, into up to {most} parts: a smaller dt keeps the structure"))
-    change = trajectory.energy - trajectory.energy[0]
-    kinetic = 0.5 * (trajectory.p * trajectory.v).sum(axis=1).max()
-    rows += [
-        ("energy change", f"{change[-1]:+.3g} J from start to end, {np.abs(change).max():.3g} J at most in between"),
-        ("kinetic energy", f"up to {kinetic:.3g} J"),
         ("q at the end [rad or m]", "  ".join(f"{x:.6g}" for x in trajectory.q[-1])),
         ("v at the end [rad/s or m/s]", "  ".join(f"{x:.6g}" for x in trajectory.v[-1])),
         # The log has the first.
