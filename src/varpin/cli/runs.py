@@ -65,7 +65,7 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
         outputs = writers_of(request, file.marks)
         return _run(request, errors, file.robot, lambda progress: file.simulate(progress=progress), outputs)
     outputs = writers_of(request)
-    integrator = None if request.integrator is None else integrator_of_words(request.integrator)
+    integrator = integrator_of_words(request.integrator)
     scene, q0, v0, torque = motion_of(request)
     wish = {name: getattr(request, name) for name in ("dt", "steps", "duration", "tolerance")}
     if request.dt is not None:
@@ -185,20 +185,14 @@ def _status(solution: Solution, scene: str, saved: Path | None) -> str:
 def _plan_table(
     file: SceneFile, solution: Solution, told: str, wall_time: float, written: Iterable[tuple[str, object]]
 ) -> Table:
-    problem, refinement = solution.problem, solution.refinement
+    problem, most = solution.problem, np.abs(solution.trajectory.u).max(axis=0, initial=0.0)
     noise = f", and {solution.noise_cost:.6g} by noise" if solution.noise_cost else ""
-    rows: list[tuple[str, object]] = [
+    unit = "own units" if file.scene.inputs or file.scene.servo_joints else "N m or N"
+    rows = [
         ("joints", f"{file.robot.dof} of {file.required.described} computed"),
         ("horizon", f"{problem.steps} steps of {problem.dt:g} s, {problem.integrator}"),
         ("status", told),
         ("cost", f"{solution.cost:.6g}{noise}, after {solution.iterations} iterations"),
-    ]
-    if refinement is not None and refinement.tried:
-        steps = ", ".join(f"{row.dt:g} s" for row in refinement.tried)
-        rows.append(("true cost", f"{refinement.tried[refinement.chosen].true_cost:.6g}, of the steps {steps}"))
-    unit = "own units" if file.scene.inputs or file.scene.servo_joints else "N m or N"
-    most = np.abs(solution.trajectory.u).max(axis=0, initial=0.0)
-    rows += [
         ("wall time", f"{wall_time:.3g} s"),
         (f"largest controls [{unit}]", "  ".join(f"{value:.4g}" for value in most)),
         ("q at the end [rad or m]", "  ".join(f"{value:.6g}" for value in solution.trajectory.q[-1])),

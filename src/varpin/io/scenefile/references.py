@@ -38,7 +38,7 @@ class Timeline:
 
 
 # Functions of time are parts of functions of this module, because closures cannot be pickled.
-def _columns(of: Timeline, keep: Integers, t: Floats) -> Floats:
+def _columns(of: Timeline, keep: Integers | slice, t: Floats) -> Floats:
     return of.at(t)[:, keep]
 
 
@@ -59,23 +59,14 @@ def _curve(times: Floats, curve: scipy.interpolate.PchipInterpolator, t: Floats)
 
 @dataclass(frozen=True)
 class Reader:
-    """What the values of a reference are of.
-
-    Attributes:
-        where: The place of the reference.
-        robot: The robot of the file, whose postures have names.
-        names: The components.
-        what: One of them, in a word.
-        dt: Time step [s].
-        end: Of the horizon [s].
-    """
+    """What the values of a reference are of."""
 
     where: Where
-    robot: Robot
-    names: Sequence[str]
-    what: str
-    dt: float
-    end: float
+    robot: Robot  # of the file, whose postures have names
+    names: Sequence[str]  # the components
+    what: str  # one of them, in a word
+    dt: float  # time step [s]
+    end: float  # of the horizon [s]
 
 
 def _sine(of: str, amplitude: float, frequency: float, phase: float = 0.0) -> tuple[str, float, float, float]:
@@ -135,8 +126,8 @@ def _samples(reader: Reader, file: Any) -> Timeline:
     return Timeline(partial(_lines, t, rows))
 
 
-def timeline(given: Any, reader: Reader, keep: Integers | None = None) -> Timeline:
-    """The values over time of a reference, or some of its components."""
+def timeline(given: Any, reader: Reader, keep: Integers | slice) -> Timeline:
+    """The values over time of a reference, of the components to ``keep``."""
     where, names = reader.where, reader.names
     for kind in (_samples, _waypoints, _sines):
         if isinstance(given, Mapping) and given.keys() & inspect.signature(kind).parameters.keys():
@@ -146,7 +137,7 @@ def timeline(given: Any, reader: Reader, keep: Integers | None = None) -> Timeli
         posture = isinstance(given, str) and tuple(names) == reader.robot.joint_names
         values = where.positions(given, reader.robot) if posture else where.numbers(given, names, reader.what)
         found = Timeline(partial(_waves, values, ()), True)
-    return found if keep is None else replace(found, at=partial(_columns, found, keep))
+    return replace(found, at=partial(_columns, found, keep))
 
 
 def _csv(path: Path) -> dict[str, Floats]:

@@ -399,33 +399,16 @@ def _noise(root: Where, tables: Mapping[str, Any], robot: Robot, driven: Sequenc
 
 def _cost(task: Task, where: Where, kind: str, make: type[Cost], own: dict[str, Any]) -> Cost | None:
     """A term of the cost; None if it weighs nothing of the task's joints."""
-    scene, robot, target_key, keys = task.scene, task.robot, kinds.target_key(kind), kinds.cost_keys(kind)
+    scene, robot, keys = task.scene, task.robot, kinds.cost_keys(kind)
     where.table(own, keys, [key for key, needed in keys.items() if needed])
     names, what = kinds.AXES.get(kind, ("weight",)), "component"
-    keep: Integers | None = None
+    keep: Any = slice(None)
     if kind in kinds.OF_CONTROLS:
         names, keep, what = task.motors, task.columns, "joint"
     elif kind in kinds.OF_JOINTS:
         names, keep, what = robot.joint_names, task.joints, "joint"
-    weight = where.at("weight").numbers(own.pop("weight", 1.0), names, what)
-    weight = weight if keep is None else weight[keep]
-    hold, given, at = own.pop("hold", None), own.pop(target_key, None), where.at(target_key)
+    weight = where.at("weight").numbers(own.pop("weight", 1.0), names, what)[keep]
     terminal = where.at("terminal").check(flag, own.pop("terminal", False))
-    if hold is not None and given is not None:
-        raise where.error(f"hold and {target_key} exclude each other: give one of them")
-    if hold is not None:
-        wanted = task.q0 if hold is True else where.at("hold").positions(hold, robot)[task.joints]
-        own[target_key] = closest_controls(scene, wanted)
-    elif kind == "control_rate":
-        own[target_key] = None if given is None else at.numbers(given, names, what)[keep]
-    elif target_key:
-        turned = kind == "frame_orientation"
-        reader = task.reader(at, kinds.ANGLES if turned else names, what)
-        target = timeline(0.0 if given is None else given, reader, keep)
-        if kind == "tracking" and target.constant:
-            at.refuse_degrees(target(0.0), scene.robot.joint_names, scene.robot.slides.tolist())
-        value: Any = partial(_turned_at, target) if turned else target
-        own[target_key] = value(0.0) if target.constant else value
     if kind.endswith("_limits"):
         limits = scene.robot.position_limits if kind == "joint_limits" else scene.robot.velocity_limit
         if not np.isfinite(limits).any():
@@ -434,6 +417,7 @@ def _cost(task: Task, where: Where, kind: str, make: type[Cost], own: dict[str, 
             raise where.at("type").error(f"robot {robot.name!r} has no such limits")
         if "margin" in own:
             own["margin"] = where.at("margin").numbers(own["margin"], names)[keep]
+    own |= _target(task, where, kind, own, names, what, keep)
     if not weight.any():
         return None
     own["weight"] = float(weight[0]) if kind == "manipulability" else weight
@@ -441,3 +425,27 @@ def _cost(task: Task, where: Where, kind: str, make: type[Cost], own: dict[str, 
     with where.named(own):
         cost = make(**own, **others)
     return costs.Terminal(cost) if terminal else cost
+
+
+def _target(
+    task: Task, where: Where, kind: str, own: dict[str, Any], names: Sequence[str], what: str, keep: Any
+) -> dict[str, Any]:
+    """The target of a term by its key, from the keys of its table, which lose it; of the components to ``keep``."""
+    key, robot = kinds.target_key(kind), task.scene.robot
+    hold, given, at = own.pop("hold", None), own.pop(key, None), where.at(key)
+    if hold is not None and given is not None:
+        raise where.error(f"hold and {key} exclude each other: give one of them")
+    if hold is not None:
+        q = task.q0 if hold is True else where.at("hold").positions(hold, task.robot)[task.joints]
+        return {key: closest_controls(task.scene, q)}
+    if kind == "control_rate":
+        return {key: None if given is None else at.numbers(given, names, what)[keep]}
+    if not key:
+        return {}
+    turned = kind == "frame_orientation"
+    reader = task.reader(at, kinds.ANGLES if turned else names, what)
+    target = timeline(0.0 if given is None else given, reader, keep)
+    if kind == "tracking" and target.constant:
+        at.refuse_degrees(target(0.0), robot.joint_names, robot.slides.tolist())
+    value: Any = partial(_turned_at, target) if turned else target
+    return {key: value(0.0) if target.constant else value}
