@@ -28,7 +28,7 @@ from varpin.simulation.simulate import simulate
 from varpin.study.checks import LEVELS, condition, findings, finite, measures
 from varpin.study.exact import before_step, exact_motion
 from varpin.study.record import Progress, Study, collect
-from varpin.support.checks import positive
+from varpin.support.checks import positive, tuple_of
 from varpin.trajectory import Trajectory
 
 INTEGRATORS: tuple[Integrator, ...] = (
@@ -128,8 +128,8 @@ class Record(Study[Cell]):
     def notes(self) -> tuple[str, ...]:
         """What a reader of the table has to know."""
         return (
-            "errors: the largest distance in q from the exact motion, as a share of its travel; E: the largest error "
-            "of the energy balance, as a share of the energy that the motion exchanges",
+            "error: the largest distance in q from the exact motion, as a share of its travel; energy error: the "
+            "largest error of the energy balance, as a share of the energy that the motion exchanges",
         )
 
     def note(self, run: Cell) -> str:
@@ -235,8 +235,7 @@ def check_robot(
 
     It falls at steps from 1e-6 s to 0.5 s, turns fast and far, floats, hangs on stiff springs and dampers, is pushed to
     and fro, and trembles. Momenta and energies are held against Pinocchio's, q and v against LSODA's motion at 1e-11,
-    energy and momentum against their balance, symmetric methods against the way back, and the derivatives of
-    variational ones against A' J A = J.
+    energies against their balance, and the derivatives of variational methods against A' J A = J.
 
     Main args:
         robot: The robot, its name, or the path of its file.
@@ -251,12 +250,12 @@ def check_robot(
 
     Raises:
         RobotError: There is no such robot, or its file cannot be read.
-        InputError: ``patience`` is not positive.
+        InputError: ``patience`` is not positive, or ``integrators`` are none.
         StudyInterrupted: Ctrl-C; holds the motions so far. It is a KeyboardInterrupt.
     """
     arm = robot if isinstance(robot, Robot) else load_robot(robot)
     limit = positive("patience", patience, "s")
-    members = INTEGRATORS if integrators is None else integrators
+    members = INTEGRATORS if integrators is None else tuple_of("integrators", integrators, Integrator)
     jobs = [(motion, member) for motion in motions_of(arm) for member in members]
     cells = (cell(motion.name, partial(replace, motion), member, limit) for motion, member in jobs)
     return collect(Record((), arm.name), cells, len(jobs), progress)
@@ -290,13 +289,7 @@ def cell(name: str, build: Callable[[], Motion], integrator: Integrator, patienc
 def judge(
     trajectory: Trajectory, error: VarpinError | None, wrong: tuple[str, ...]
 ) -> tuple[Kind, tuple[str, ...], tuple[str, ...]]:
-    """The kind of a motion, varpin's error and warnings, and the failed checks.
-
-    Args:
-        trajectory: The motion.
-        error: The error that ended it; None for a complete motion.
-        wrong: The failed checks.
-    """
+    """The kind of a motion, varpin's error, which ended it, and warnings, and the failed checks."""
     # These warnings are not about the steps that the checks judge.
     elsewhere = limits.KINDS
     warnings = (warning for warning in trajectory.warnings if warning.kind not in elsewhere)

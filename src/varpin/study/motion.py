@@ -93,15 +93,10 @@ class Setting(Frozen):
 
 
 def fastest(run: Callable[[], tuple[Result, float]], repeats: int, within: float = math.inf) -> tuple[Result, float]:
-    """The result and the time [s] of the fastest of several runs.
+    """The result and the time [s] of the fastest of several runs; 0 ``repeats`` are the first alone.
 
     The first run finds caches cold and a processor at rest: it does not count unless it is so long that this is
-    nothing.
-
-    Args:
-        run: Makes a run; returns its result and time.
-        repeats: How many count; 0 for the first alone.
-        within: Time after which none is begun if one counts [s].
+    nothing. None is begun after the time ``within`` [s] if one counts.
     """
     begin, first = time.perf_counter(), run()
     counted = [first] if not repeats or first[1] >= min(_LONG, within) else []

@@ -148,17 +148,7 @@ class StudyInterrupted(KeyboardInterrupt):
 
 
 def collect(base: Made, runs: Generator[Any, None, None], total: int, progress: Progress | None) -> Made:
-    """A study with all of its runs, which are measured one by one.
-
-    Args:
-        base: The study without runs.
-        runs: Measures the runs.
-        total: Their number.
-        progress: Called with (runs done, runs in all) after each.
-
-    Raises:
-        StudyInterrupted: Ctrl-C.
-    """
+    """The study ``base`` with its runs, which are measured one by one; raises StudyInterrupted at Ctrl-C."""
     done: list[Any] = []
     try:
         with closing(runs):
