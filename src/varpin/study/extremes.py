@@ -87,18 +87,18 @@ class Cell:
 
     trial: str
     integrator: str
-    kind: Kind
-    error: float
-    joint: float
-    velocity: float
-    energy: float
-    symplecticity: float
-    record: float
-    said: tuple[str, ...]
-    found: tuple[str, ...]
-    done: int
-    steps: int
-    seconds: float
+    kind: Kind = Kind.REFUSED
+    error: float = math.nan
+    joint: float = math.nan
+    velocity: float = math.nan
+    energy: float = math.nan
+    symplecticity: float = math.nan
+    record: float = math.nan
+    said: tuple[str, ...] = ()
+    found: tuple[str, ...] = ()
+    done: int = 0
+    steps: int = 0
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -263,27 +263,22 @@ def check_robot(
 
 def cell(name: str, build: Callable[[], Motion], integrator: Integrator, patience: float) -> Cell:
     """A motion with an integrator; errors of varpin refuse it, others are faults."""
-    begin, done, steps, said, wrong = time.perf_counter(), 0, 0, (), ()  # type: float, int, int, tuple[str, ...], tuple[str, ...]
-    found: dict[str, float] = {}
+    begin, made = time.perf_counter(), Cell(name, str(integrator))
     try:
         motion = build()
-        steps = motion.steps
-        trajectory, error = attempt(
-            patience, motion.scene, motion.q0, motion.v0, dt=motion.dt, steps=steps,
-            controls=motion.controls, increments=motion.increments, integrator=integrator,
-        )  # fmt: skip
+        made = replace(made, steps=motion.steps)
+        given = {"dt": motion.dt, "steps": motion.steps, "controls": motion.controls, "increments": motion.increments}
+        trajectory, error = attempt(patience, motion.scene, motion.q0, motion.v0, **given, integrator=integrator)
     except VarpinError as refusal:
-        kind, said = Kind.REFUSED, (line_of(refusal),)
+        made = replace(made, said=(line_of(refusal),))
     except Exception as fault:
-        kind, wrong = Kind.WRONG, (f"unnamed error: {line_of(fault)}",)
+        made = replace(made, kind=Kind.WRONG, found=(f"unnamed error: {line_of(fault)}",))
     else:
-        found, done = motion.measures(integrator, trajectory), trajectory.steps
-        kind, said, wrong = judge(trajectory, error, findings(found, condition(motion.scene, motion.q0)))
-    return Cell(
-        trial=name, integrator=str(integrator), kind=kind, said=said, found=wrong,
-        done=done, steps=steps, seconds=round(time.perf_counter() - begin, 3),
-        **dict.fromkeys(LEVELS, math.nan) | {name: found[name] for name in LEVELS if name in found},
-    )  # fmt: skip
+        measured = motion.measures(integrator, trajectory)
+        kind, said, wrong = judge(trajectory, error, findings(measured, condition(motion.scene, motion.q0)))
+        known: dict[str, Any] = {level: measured[level] for level in LEVELS if level in measured}
+        made = replace(made, kind=kind, said=said, found=wrong, done=trajectory.steps, **known)
+    return replace(made, seconds=round(time.perf_counter() - begin, 3))
 
 
 def judge(

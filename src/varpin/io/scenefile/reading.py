@@ -100,7 +100,7 @@ class Where:
             raise at.error(f"must be a list of tables, written [[{at.key}]], got {_shown(found)}")
         return [(at.at(index), entry) for index, entry in enumerate(found)]
 
-    def kinds(
+    def entries(
         self, given: Mapping[str, Any], name: str, kinds: Mapping[str, _T]
     ) -> list[tuple[Where, str, _T, dict[str, Any]]]:
         """The tables of a list under a key: the place of each, and what :meth:`kind` tells of it."""

@@ -80,7 +80,7 @@ class Task:
 
     def complete(self) -> Task:
         """The task with its costs and controls."""
-        given = self.where.kinds(self.tables, "cost", kinds.COSTS)
+        given = self.where.entries(self.tables, "cost", kinds.COSTS)
         if given:
             self.require_start()
         found = [_cost(self, *each) for each in given]
@@ -136,10 +136,10 @@ class Task:
     def plan_constraints(self) -> list[PlanConstraint]:
         """The constraints of a plan."""
         found, robot = [], self.scene.robot
-        for where, word, kind, own in self.where.kinds(self.tables, "plan_constraint", kinds.PLAN_CONSTRAINTS):
+        for where, word, kind, own in self.where.entries(self.tables, "plan_constraint", kinds.PLAN_CONSTRAINTS):
             others: dict[str, Any] = {} if word == "control_rate" else {"robot": robot}
             if word == "clearance":
-                bodies = where.kinds({"obstacles": own.pop("obstacles", [])}, "obstacles", kinds.OBSTACLES)
+                bodies = where.entries({"obstacles": own.pop("obstacles", [])}, "obstacles", kinds.OBSTACLES)
                 others |= {"obstacles": [_obstacle(*body) for body in bodies], "capsules": None}
                 if "srdf" in own:
                     own["srdf"] = where.at("srdf").file(own["srdf"])
@@ -169,7 +169,7 @@ def joints_of_frame(robot: Robot, frame: str) -> Mask:
 
 def required_of(task: Task, *, idle: bool) -> tuple[Task, Required]:
     """The task without idle joints, unless they stay, and the report on it."""
-    scene, kept = task.scene, task.where.kinds(task.tables, "plan_constraint", kinds.PLAN_CONSTRAINTS)
+    scene, kept = task.scene, task.where.entries(task.tables, "plan_constraint", kinds.PLAN_CONSTRAINTS)
     out: Mapping[str, float] = {}
     if idle and not (kept or scene.constraints):
         touched = np.any([np.zeros(scene.robot.dof), *(_touched(cost, task) for cost in task.costs)], axis=0)
@@ -290,7 +290,7 @@ def _on_robot(root: Where, tables: Mapping[str, Any], robot: Robot, dt: float, s
     driven, gear, limit = _actuation(root.at("actuation"), tables.get("actuation", {}), robot)
     matrix = np.zeros((robot.dof, len(driven)))
     matrix[[robot.coordinate(joint) for joint in driven], np.arange(len(driven))] = gear
-    own = root.kinds(tables, "constraint", kinds.CONSTRAINTS)
+    own = root.entries(tables, "constraint", kinds.CONSTRAINTS)
     constraints = [_bound(where, kind, keys, robot) for where, _, kind, keys in own]
     given = {
         "gravity": tables.get("gravity", True),
@@ -371,7 +371,7 @@ def _forces(root: Where, tables: Mapping[str, Any], robot: Robot, driven: Sequen
     most = np.full(robot.dof, np.inf)
     most[[robot.coordinate(joint) for joint in driven]] = limit
     found: list[Force] = []
-    for place, word, kind, own in root.kinds(tables, "force", kinds.FORCES):
+    for place, word, kind, own in root.entries(tables, "force", kinds.FORCES):
         if word == "friction" and own.get("level") == "robot":
             own["level"] = robot.friction
         force = _bound(place, kind, own, robot)
@@ -387,7 +387,7 @@ def _forces(root: Where, tables: Mapping[str, Any], robot: Robot, driven: Sequen
 def _noise(root: Where, tables: Mapping[str, Any], robot: Robot, driven: Sequence[str]) -> list[Noise]:
     """The noise models of a file."""
     found: list[Noise] = []
-    for place, word, kind, own in root.kinds(tables, "noise", kinds.NOISE):
+    for place, word, kind, own in root.entries(tables, "noise", kinds.NOISE):
         whose, what = (driven, "driven joint") if word == "control" else (robot.joint_names, "joint")
         if "intensity" in own:
             own["intensity"] = place.at("intensity").numbers(own["intensity"], whose, what)
