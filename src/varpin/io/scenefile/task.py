@@ -221,12 +221,10 @@ def task_of(root: Where, tables: dict[str, Any]) -> Task:
     root.table(tables, TABLES, ("robot", "horizon"))
     at = root.at("horizon")
     keys = ("dt", "steps", "duration", "hold", "sampling", "controls", "between_nodes")
-    horizon = at.table(tables["horizon"], keys, ("dt",))
+    horizon = at.table(tables["horizon"], keys)
     costs = len(root.tables(tables, "cost"))
-    if ("steps" in horizon) == ("duration" in horizon):
-        raise at.error("a horizon has steps, or a duration [s]: give one of them")
     with at.named(horizon):
-        dt, steps = time_steps(horizon["dt"], horizon.get("steps"), horizon.get("duration"))
+        dt, steps = time_steps(horizon.get("dt"), horizon.get("steps"), horizon.get("duration"))
         count("steps", steps, 1)
     if steps * max(1, _PER_COST * costs) > _MOST_STEPS:
         raise at.error(f"{steps} steps are more than {_MOST_STEPS}, or a tenth of that divided by the number of costs")
