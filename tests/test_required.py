@@ -77,6 +77,7 @@ def test_idle_fingers_are_left_out_and_the_answer_is_the_same(tmp_path):
         ({"more": '[[cost]]\ntype = "frame_position"\nframe = "link_7.0"\ntarget = [0, 0, 0]'}, 8),
         ({"more": '[[cost]]\ntype = "center_of_mass"\ntarget = [0, 0, 0]'}, 16),
         ({"more": '[[cost]]\ntype = "joint_limits"'}, 4),  # within them
+        ({"more": f'[[cost]]\ntype = "joint_limits"\nmargin = {[0.01] * 16}'}, 4),
         ({"more": '[[cost]]\ntype = "joint_limits"', "q": '"joint_12.0" = 0.2'}, 8),  # the thumb is below its least
         ({"more": '[[cost]]\ntype = "tracking"\nreference = { "joint_5.0" = 0.4, "joint_12.0" = 0.3 }'}, 4),
     ],

@@ -333,7 +333,7 @@ MISTAKES = [
     (changed("mcp = 1e-5", "mcp = -1e-5"), "damping"),
     (changed("stiffness = 1e-3", 'stiffness = "1e-3"'), "springs.stiffness"),
     (changed("amplitude = 0.2", "amplitude = true"), "cost[0].reference.sines[0].amplitude"),
-    (changed("duration = 0.1", "duration = 0.1\nsteps = 50"), "horizon"),
+    (changed("duration = 0.1", "duration = 0.1\nsteps = 50"), "horizon.dt"),
     (changed("duration = 0.1", "duration = 0.101"), "horizon.duration"),
     (changed("duration = 0.1", "duration = 1e9"), "horizon"),
     (changed("q = [0.5, 0.3]", "q = [30.0, 20.0]"), "initial.q"),
@@ -442,7 +442,7 @@ def test_odd_values_anywhere_are_taken_or_refused_in_words(tmp_path, monkeypatch
 
 
 def target_of(file):
-    return file._task.terms[0].target
+    return file.problem.cost.terms[0].reference
 
 
 def test_an_option_of_solve_is_refused_with_its_key(tmp_path):

@@ -11,7 +11,6 @@ from refusals import refused
 
 import varpin as vp
 from varpin.show.plots import plot_study
-from varpin.show.study_report import write_report
 from varpin.simulation.tolerance import INTEGRATORS
 from varpin.study import advice as advising
 from varpin.study.record import pareto_front
@@ -66,7 +65,7 @@ def test_pareto_front_is_what_nothing_beats(oscillator):
         for run in oscillator.runs:
             beaten = any(
                 other.seconds < run.seconds
-                and oscillator.error_of(other, quantity) < oscillator.error_of(run, quantity)
+                and oscillator.value_of(other, quantity) < oscillator.value_of(run, quantity)
                 for other in oscillator.runs
             )
             assert (run in chosen) != beaten
@@ -80,7 +79,7 @@ def test_errors_below_the_references_own_are_flagged():
     coarse, fine = record.runs
     assert not record.at_floor(coarse)
     assert record.at_floor(fine)
-    assert record.error_of(fine) == record.reference_error > 0.0
+    assert record.value_of(fine) == record.reference_error > 0.0
     at = record.columns().index("error in q [rad or m]")
     assert record.row(fine)[at] == f"<{record.reference_error:.3g}"
     assert record.row(coarse)[at] == f"{coarse.error:.3g}"
@@ -164,7 +163,7 @@ def test_wrong_arguments(study, change, facts):
         study(scene, [0.7], [0.3], **options)
 
 
-def test_figure_and_report(oscillator, tmp_path):
+def test_figure_and_table(oscillator, tmp_path):
     for quantity in ("q", "energy"):
         _, axes = plot_study(oscillator, quantity=quantity)
         names = [text.get_text() for text in axes.get_legend().get_texts()]
@@ -172,14 +171,11 @@ def test_figure_and_report(oscillator, tmp_path):
         assert names == [*(str(integrator) for integrator in INTEGRATORS), "Pareto front", *reference]
     strokes = [(line.get_color(), line.get_linestyle()) for line in axes.get_lines()]
     assert len(set(strokes)) == len(strokes)
-    paths = write_report(tmp_path, "tradeoff", oscillator, "A <spring>")
-    assert [path.name for path in paths] == ["tradeoff.csv", "tradeoff.png", "tradeoff.html"]
-    rows = list(csv.DictReader(paths[0].open()))
+    rows = list(csv.DictReader(oscillator.to_csv(tmp_path / "runs.csv").open()))
     assert len(rows) == len(oscillator.runs)
     assert float(rows[0]["error in q [rad or m]"]) == oscillator.runs[0].error
     assert {"wall time [s]", "energy error [J]", "sweeps"} <= rows[0].keys()
-    page = paths[2].read_text()
-    assert "<h1>A &lt;spring&gt;</h1>" in page
+    page = oscillator._repr_html_()
     assert page.count("<tr") == 1 + len(oscillator.runs) + len(oscillator.notes)
 
 
@@ -199,10 +195,7 @@ def test_true_costs_of_plans(problem, tmp_path):
     assert (gaps[1] < gaps[0]).all()
     assert record.pareto()
     plot_study(record)
-    assert [path.name for path in write_report(tmp_path, "plans", record, "Plans")] == [
-        "plans.csv", "plans.png", "plans.html"
-    ]  # fmt: skip
-    assert len(list(csv.reader((tmp_path / "plans.csv").open()))) == 7
+    assert len(list(csv.reader(record.to_csv(tmp_path / "plans.csv").open()))) == 7
 
 
 def test_plans_that_fail_do_not_stop_the_others(problem):

@@ -89,16 +89,7 @@ class SingularMassMatrix(RobotError):
 
 
 class InputError(VarpinError, ValueError):
-    """An argument has a wrong shape, type or value.
-
-    Attributes:
-        argument: Of :class:`varpin.OptimalControlProblem` the argument at fault, ``controls`` or ``constraints[i]``;
-            None elsewhere.
-    """
-
-    def __init__(self, problem: str, argument: str | None = None) -> None:
-        self.argument = argument
-        super().__init__(problem)
+    """An argument has a wrong shape, type or value."""
 
 
 class AssemblyError(InputError):
@@ -118,6 +109,21 @@ class AssemblyError(InputError):
         )
 
 
+def similar(name: str, known: Iterable[str]) -> list[str]:
+    """The known names that are like a name."""
+    names = tuple(known)
+    return difflib.get_close_matches(name, names, n=3, cutoff=0.5) or [own for own in names if name and name in own][:3]
+
+
+def suggestion(name: str, known: Iterable[str], kind: str, most: int = _MOST_NAMES) -> str:
+    """A hint at similar names, and the first of the known ones, which are of a ``kind``, in the plural."""
+    names = tuple(known)
+    matches = similar(name, names)
+    hint = f"did you mean {' or '.join(map(repr, matches))}? " if matches else ""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"{hint}{kind}: {', '.join(names[:most]) or 'none'}{more}"
+
+
 class UnknownName(InputError):
     """A name that is not among the known ones.
 
@@ -131,12 +137,8 @@ class UnknownName(InputError):
 
     def __init__(self, name: str, known: Iterable[str], lack: str) -> None:
         self.name, self.known = name, tuple(known)
-        within = [other for other in self.known if name and name in other]
-        self.matches = difflib.get_close_matches(name, self.known, n=3, cutoff=0.5) or within[:3]
-        hint = f"did you mean {' or '.join(map(repr, self.matches))}? " if self.matches else ""
-        more = f" and {len(self.known) - _MOST_NAMES} more" if self.known[_MOST_NAMES:] else ""
-        names = ", ".join(self.known[:_MOST_NAMES]) or "none"
-        super().__init__(f"{lack} {name!r}; {hint}{self.kind}: {names}{more}")
+        self.matches = similar(name, self.known)
+        super().__init__(f"{lack} {name!r}; {suggestion(name, self.known, self.kind)}")
 
 
 class UnknownJoint(UnknownName):

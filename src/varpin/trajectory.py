@@ -331,16 +331,26 @@ class Trajectory(Frozen):
             f"{self.integrator}{flag}{reached}{warning_count(self.warnings)})"
         )
 
+    @property
+    def rows(self) -> list[tuple[str, object]]:
+        """The motion as names and texts: its steps, its error and its energies."""
+        change = self.energy - self.energy[0]
+        kinetic = 0.5 * (self.p * self.v).sum(axis=1).max()
+        rows: list[tuple[str, object]] = [("steps", f"{self.steps} of {self.dt:g} s, {self.duration:g} s in all")]
+        if self.accuracy is not None:
+            rows.append(("tolerance", str(self.accuracy)))
+        elif self.error_text:
+            rows.append(("estimated error in q", f"{self.error_text.removeprefix('error ')} rad or m"))
+        if split := self.statistics.split_steps:
+            most = self.statistics.substeps.max()
+            text = f"{split} of {self.steps}, into up to {most} parts: a smaller dt keeps the structure"
+            rows.append(("split steps", text))
+        text = f"{change[-1]:+.3g} J from start to end, {np.abs(change).max():.3g} J at most in between"
+        return [*rows, ("energy change", text), ("kinetic energy", f"up to {kinetic:.3g} J")]
+
     def _repr_html_(self) -> str:
-        rows: list[tuple[str, object]] = [
-            ("steps", f"{self.steps} of {self.dt:g} s, {self.duration:g} s in all"),
-            ("integrator", self.integrator),
-            ("energy [J]", f"{self.energy[0]:.6g} at first, {self.energy[-1]:.6g} in the end"),
-            ("energy's largest change [J]", f"{np.abs(self.energy - self.energy[0]).max():.3g}"),
-        ]
-        if self.error_text:
-            rows.append(("estimated error of q [rad or m]", self.error_text.removeprefix("error ")))
-        rows += [("warning", warning) for warning in self.warnings]
+        warnings = [("warning", warning) for warning in self.warnings]
+        rows = [("integrator", self.integrator), *self.rows, *warnings]
         ends = zip(self.joint_names, self.q[0], self.q[-1], self.q.min(axis=0), self.q.max(axis=0), strict=True)
         speeds = np.abs(self.v).max(axis=0)
         joints = [(name, *map(float, row), float(speed)) for (name, *row), speed in zip(ends, speeds, strict=True)]

@@ -82,8 +82,10 @@ def add_integrator(parser: argparse.ArgumentParser, default: str = _CHOSEN) -> N
     parser.add_argument("--integrator", metavar="NAME", help=text)
 
 
-def integrator_of_words(text: str) -> Integrator:
+def integrator_of_words(text: str | None) -> Integrator | None:
     """The integrator of a word of :func:`add_integrator`."""
+    if text is None:
+        return None
     name, bracket, rest = text.strip().partition("(")
     # runge_kutta_4 and RUNGEKUTTA4 are RungeKutta4.
     plain = {member.lower(): member for member in BY_NAME}

@@ -25,7 +25,7 @@ examples:
   varpin solve finger_tracking --html finger.html --save plan.npz
   varpin replay plan.npz --robot finger_tracking
   varpin advise ur5 --tolerance 1e-6 --duration 1
-  varpin extremes finger --out finger-extremes
+  varpin extremes finger --save extremes.csv
   varpin identify ur5 log.csv --parameters damping payload --q-noise 2e-4 --save ur5-found.urdf
 """
 

@@ -77,7 +77,7 @@ def _identify(request: argparse.Namespace, errors: Console) -> int:
     logs, apart = ([Log.load(path) for path in paths] for paths in (request.logs, request.held_out))
     options: dict[str, Any] = {name: getattr(request, name) for name in ("delay", "dt", "horizon", "evaluations")}
     options |= {name: values_of(name.replace("_", "-"), getattr(request, name)) for name in ("q_noise", "v_noise")}
-    options["integrator"] = None if request.integrator is None else integrator_of_words(request.integrator)
+    options["integrator"] = integrator_of_words(request.integrator)
     options = {name: value for name, value in options.items() if value is not None}
     with request.interrupts.keeping():
         with progress_bar(errors, _EXPECTED, quiet=request.quiet, unit="evaluations") as progress:

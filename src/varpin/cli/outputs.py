@@ -12,7 +12,6 @@ from typing import Any
 from rich.console import Console
 
 from varpin.cli.console import INTERRUPTED, MISTAKE, complain
-from varpin.control import Solution
 from varpin.errors import InputError, VarpinError
 from varpin.io.archive import atomic_file
 from varpin.marks import Marks
@@ -28,11 +27,12 @@ def add_outputs(parser: argparse.ArgumentParser, what: str) -> None:
     add_replay_options(add_files(parser, "NPZ", save, "draw an overview, as png, pdf or svg"))
 
 
-def add_files(parser: argparse.ArgumentParser, ending: str, save: str, plot: str) -> argparse._ActionsContainer:
-    """Add ``--save``, ``--plot`` and ``--quiet``; returns their group."""
+def add_files(parser: argparse.ArgumentParser, ending: str, save: str, plot: str = "") -> argparse._ActionsContainer:
+    """Add ``--save``, ``--plot`` if there is a figure, and ``--quiet``; returns their group."""
     outputs = parser.add_argument_group("outputs")
     outputs.add_argument("--save", type=Path, metavar=ending, help=save)
-    outputs.add_argument("--plot", type=Path, metavar="PNG", help=plot)
+    if plot:
+        outputs.add_argument("--plot", type=Path, metavar="PNG", help=plot)
     outputs.add_argument("--quiet", action="store_true", help="print warnings and errors only")
     return outputs
 
@@ -55,10 +55,18 @@ MarksOf = Callable[[float], Marks]
 
 def writers_of(request: argparse.Namespace, marks: MarksOf | None = None) -> Writers:
     """Writers of the requested files of a motion, the most important first."""
-    show = partial(_show, speed_of(request), request.trace, marks)
+    speed = speed_of(request)
+
+    def show(option: str, path: Path, robot: Robot, motion: Trajectory, _result: object) -> None:
+        from varpin.show.replay.motion import replay  # noqa: PLC0415 - meshcat is slow to import
+
+        task = Marks() if marks is None else marks(motion.duration)
+        files: dict[str, Any] = {option: path}
+        replay(robot, motion, **files, speed=speed, marks=replace(task, trace=request.trace or task.trace))
+
     return files_of(
         request,
-        ("save", (".npz",), _save),
+        ("save", (".npz",), lambda path, _robot, _motion, result: result.save(path)),
         ("plot", PICTURES, _plot),
         ("html", (".html", ".htm"), partial(show, "html")),
         ("video", FORMATS, partial(show, "video")),
@@ -83,37 +91,16 @@ def files_of(request: argparse.Namespace, *options: tuple[str, Sequence[str], Ca
     return found
 
 
-def _save(path: Path, _robot: Robot, _trajectory: Trajectory, result: Trajectory | Solution) -> None:
-    result.save(path)
-
-
-def _plot(path: Path, robot: Robot, trajectory: Trajectory, _result: Trajectory | Solution) -> None:
+def _plot(path: Path, robot: Robot, motion: Trajectory, _result: object) -> None:
     from varpin.show.plots import plot_trajectory  # noqa: PLC0415 - matplotlib is slow to import
 
-    save_figure(path, plot_trajectory(trajectory, robot=robot)[0])
+    save_figure(path, plot_trajectory(motion, robot=robot)[0])
 
 
 def save_figure(path: Path, figure: Any) -> None:
     """Write a figure in the format of the path."""
     with atomic_file(path) as stream:
         figure.savefig(stream, format=path.suffix[1:].lower(), dpi=150)
-
-
-def _show(
-    speed: float,
-    trace: Sequence[str],
-    marks: MarksOf | None,
-    option: str,
-    path: Path,
-    robot: Robot,
-    trajectory: Trajectory,
-    _result: Trajectory | Solution,
-) -> None:
-    from varpin.show.replay.motion import replay  # noqa: PLC0415 - meshcat is slow to import
-
-    task = Marks() if marks is None else marks(trajectory.duration)
-    files: dict[str, Any] = {option: path}
-    replay(robot, trajectory, **files, speed=speed, marks=replace(task, trace=trace or task.trace))
 
 
 def speed_of(request: argparse.Namespace) -> float:

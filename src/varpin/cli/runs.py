@@ -65,7 +65,7 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
         outputs = writers_of(request, file.marks)
         return _run(request, errors, file.robot, lambda progress: file.simulate(progress=progress), outputs)
     outputs = writers_of(request)
-    integrator = None if request.integrator is None else integrator_of_words(request.integrator)
+    integrator = integrator_of_words(request.integrator)
     scene, q0, v0, torque = motion_of(request)
     wish = {name: getattr(request, name) for name in ("dt", "steps", "duration", "tolerance")}
     if request.dt is not None:
@@ -115,23 +115,9 @@ def _run(
 
 def _summary(trajectory: Trajectory, wall_time: float, written: Iterable[tuple[str, object]]) -> Table:
     """A table of a run: its settings, work, result and files."""
-    steps, statistics, accuracy = trajectory.steps, trajectory.statistics, trajectory.accuracy
-    rows: list[tuple[str, object]] = [
-        ("steps", f"{steps}, {trajectory.dt:g} s each, {trajectory.duration:g} s in all"),
+    rows = [
+        *trajectory.rows,
         ("wall time", f"{wall_time:.3g} s"),
-    ]
-    if accuracy is not None:
-        rows.append(("tolerance", str(accuracy)))
-    elif trajectory.error_text:
-        rows.append(("estimated error in q", f"{trajectory.error_text.removeprefix('error ')} rad or m"))
-    if split := statistics.split_steps:
-        most = statistics.substeps.max()
-        rows.append(("split steps", f"{split} of {steps}, into up to {most} parts: a smaller dt keeps the structure"))
-    change = trajectory.energy - trajectory.energy[0]
-    kinetic = 0.5 * (trajectory.p * trajectory.v).sum(axis=1).max()
-    rows += [
-        ("energy change", f"{change[-1]:+.3g} J from start to end, {np.abs(change).max():.3g} J at most in between"),
-        ("kinetic energy", f"up to {kinetic:.3g} J"),
         ("q at the end [rad or m]", "  ".join(f"{x:.6g}" for x in trajectory.q[-1])),
         ("v at the end [rad/s or m/s]", "  ".join(f"{x:.6g}" for x in trajectory.v[-1])),
         # The log has the first.
@@ -199,20 +185,14 @@ def _status(solution: Solution, scene: str, saved: Path | None) -> str:
 def _plan_table(
     file: SceneFile, solution: Solution, told: str, wall_time: float, written: Iterable[tuple[str, object]]
 ) -> Table:
-    problem, refinement = solution.problem, solution.refinement
+    problem, most = solution.problem, np.abs(solution.trajectory.u).max(axis=0, initial=0.0)
     noise = f", and {solution.noise_cost:.6g} by noise" if solution.noise_cost else ""
-    rows: list[tuple[str, object]] = [
+    unit = "own units" if file.scene.inputs or file.scene.servo_joints else "N m or N"
+    rows = [
         ("joints", f"{file.robot.dof} of {file.required.described} computed"),
         ("horizon", f"{problem.steps} steps of {problem.dt:g} s, {problem.integrator}"),
         ("status", told),
         ("cost", f"{solution.cost:.6g}{noise}, after {solution.iterations} iterations"),
-    ]
-    if refinement is not None and refinement.tried:
-        steps = ", ".join(f"{row.dt:g} s" for row in refinement.tried)
-        rows.append(("true cost", f"{refinement.tried[refinement.chosen].true_cost:.6g}, of the steps {steps}"))
-    unit = "own units" if file.scene.inputs or file.scene.servo_joints else "N m or N"
-    most = np.abs(solution.trajectory.u).max(axis=0, initial=0.0)
-    rows += [
         ("wall time", f"{wall_time:.3g} s"),
         (f"largest controls [{unit}]", "  ".join(f"{value:.4g}" for value in most)),
         ("q at the end [rad or m]", "  ".join(f"{value:.6g}" for value in solution.trajectory.q[-1])),

@@ -13,12 +13,11 @@ from rich.console import Console
 
 from varpin.cli.arguments import add_motion, add_robot, motion_of, robot_options
 from varpin.cli.console import FAULTY, INTERRUPTED, STEP_FAILED, progress_bar, say, show
-from varpin.errors import FileError
+from varpin.cli.outputs import PICTURES, Writers, add_files, files_of, save_figure, write_all
 from varpin.model import load_robot
 from varpin.study.advice import advise
 from varpin.study.precision import work_precision
 from varpin.study.record import Progress, Study, StudyInterrupted
-from varpin.support.checks import path_like
 from varpin.support.tables import Table
 
 if TYPE_CHECKING:
@@ -30,8 +29,8 @@ Made = TypeVar("Made", bound=Study[Any])
 def add_tradeoff(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin tradeoff``."""
     parser.description = (
-        "Run a robot's motion with every integrator and many time steps. Print and write errors against an accurate "
-        "reference, and wall times. Ctrl-C keeps the runs that are done."
+        "Run a robot's motion with every integrator and many time steps. Print errors against an accurate reference, "
+        "and wall times. Ctrl-C keeps the runs that are done."
     )
     parser.set_defaults(run=_tradeoff, log_level=logging.WARNING)
     add_robot(parser)
@@ -40,20 +39,16 @@ def add_tradeoff(parser: argparse.ArgumentParser) -> None:
     text = "repetitions of each run; default: %(default)d"
     parser.add_argument("--repeats", type=int, default=3, metavar="N", help=text)
     add_motion(parser)
-    _add_outputs(parser)
+    add_files(parser, "CSV", "write the runs", "draw errors over wall times, as png, pdf or svg")
 
 
 def _tradeoff(request: argparse.Namespace, errors: Console) -> int:
-    folder = _folder(request)
+    files = _files(request)
     scene, q0, v0, torque = motion_of(request)
     options = {"controls": torque, "duration": request.duration, "dts": request.dt, "repeats": request.repeats}
     record = _kept(request, errors, lambda progress: work_precision(scene, q0, v0, progress=progress, **options))
-    title = f"{record.robot}: speed against accuracy over {record.duration:g} s"
-    if not request.quiet:
-        show(record.table(title))
-        show("\n".join((*record.notes, *record.failures)))
-    _write(folder, "tradeoff", record, title, quiet=request.quiet)
-    return INTERRUPTED if record.missing else 0
+    table = record.table(f"{record.robot}: speed against accuracy over {record.duration:g} s")
+    return _tell(request, errors, files, record, table, *record.notes, *record.failures)
 
 
 def add_advise(parser: argparse.ArgumentParser) -> None:
@@ -69,24 +64,22 @@ def add_advise(parser: argparse.ArgumentParser) -> None:
     goal.add_argument("--budget", type=float, metavar="S", help="largest allowed wall time [s]")
     _add_duration(parser)
     add_motion(parser)
-    _add_outputs(parser, quiet=None)
+    add_files(parser, "CSV", "write the best choice of each method")
 
 
 def _advise(request: argparse.Namespace, errors: Console) -> int:
-    folder = _folder(request)
+    files = _files(request)
     scene, q0, v0, torque = motion_of(request)
     say(errors, "trying integrators on this motion, for a minute at most")
     options = {"controls": torque, "tolerance": request.tolerance, "budget": request.budget}
     advice = advise(scene, q0, v0, duration=request.duration, **options)
-    show("\n".join(advice.notes))
     best = advice.best
     words = ["--integrator", str(best.integrator), "--dt", repr(best.dt), "--steps", str(best.steps)]
-    show(f"run it: varpin simulate {shlex.quote(request.robot)} {shlex.join(words)}, and the same start and forces")
-    show(advice.table("The best of each method"))
-    show(f"(found in {advice.calibration:.2g} s)")
-    goal = f"{advice.tolerance:g} in q" if advice.tolerance is not None else f"{advice.budget:g} s"
-    _write(folder, "advice", advice, f"{advice.robot}: an integrator for {request.duration:g} s and {goal}")
-    return 0 if advice.reached else STEP_FAILED
+    command = f"varpin simulate {shlex.quote(request.robot)} {shlex.join(words)}"
+    texts = [*advice.notes, f"run it: {command}, and the same start and forces"]
+    found = f"(found in {advice.calibration:.2g} s)"
+    trouble = _tell(request, errors, files, advice, *texts, advice.table("The best of each method"), found)
+    return trouble if advice.reached else STEP_FAILED
 
 
 def add_extremes(parser: argparse.ArgumentParser) -> None:
@@ -99,26 +92,31 @@ def add_extremes(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=_extremes, log_level=logging.CRITICAL)
     add_robot(parser)
     parser.add_argument("--deep", action="store_true", help="give each motion 15 minutes of work instead of 20 s")
-    _add_outputs(parser, quiet="print nothing but what is silent wrong")
+    add_files(parser, "CSV", "write the motions")
 
 
 def _extremes(request: argparse.Namespace, errors: Console) -> int:
     from varpin.study.extremes import Kind, check_robot  # noqa: PLC0415 - most commands do not need it
 
     robot = load_robot(request.robot, **robot_options(request))
-    folder, patience = _folder(request), 900.0 if request.deep else 20.0
+    files, patience = _files(request), 900.0 if request.deep else 20.0
     if not request.quiet:
         whole = "hours" if request.deep else "minutes"
         say(errors, f"each motion takes {patience:g} s at most; all together take {whole}")
     record = _kept(request, errors, lambda progress: check_robot(robot, patience=patience, progress=progress))
-    if not request.quiet:
-        _show_kinds(record)
-    _write(folder, "extremes", record, f"{record.robot} at the extremes", quiet=request.quiet)
+    kinds = [f"{count} {kind.value}: {kind.meaning}" for kind, count in record.counts().items()]
+    trouble = _tell(request, errors, files, record, _kinds(record), *kinds)
     for cell in record.wrong():
         show(f"{Kind.WRONG.value}: {cell.trial}, {cell.integrator}: {'; '.join(cell.found)}")
-    if record.missing:
-        return INTERRUPTED
-    return FAULTY if record.wrong() else 0
+    return FAULTY if record.wrong() and not record.missing else trouble
+
+
+def _kinds(record: Record) -> Table:
+    """How many motions of each kind an integrator has."""
+    kinds, integrators = record.counts(), dict.fromkeys(cell.integrator for cell in record.runs)
+    found = {name: [cell.kind for cell in record.runs if cell.integrator == name] for name in integrators}
+    rows = [(name, *map(own.count, kinds)) for name, own in found.items()]
+    return Table(f"{record.robot} at the extremes", ("integrator", *(kind.value for kind in kinds)), rows)
 
 
 def _add_duration(parser: argparse.ArgumentParser) -> None:
@@ -126,23 +124,15 @@ def _add_duration(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=float, default=1.0, metavar="S", help=text)
 
 
-def _add_outputs(parser: argparse.ArgumentParser, quiet: str | None = "print warnings and errors only") -> None:
-    outputs = parser.add_argument_group("outputs")
-    outputs.add_argument("--out", type=Path, metavar="FOLDER", help="write a table (CSV), a figure and a page (HTML)")
-    if quiet is not None:
-        outputs.add_argument("--quiet", action="store_true", help=quiet)
+def _files(request: argparse.Namespace) -> Writers:
+    """Writers of the requested files of a study."""
+    return files_of(request, ("save", (".csv",), lambda path, study: study.to_csv(path)), ("plot", PICTURES, _plot))
 
 
-def _folder(request: argparse.Namespace) -> Path | None:
-    """The folder of the files, made if necessary; None for no files."""
-    if request.out is None:
-        return None
-    folder = path_like("--out", request.out)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"cannot make the folder {folder}: {error.strerror or error}") from None
-    return folder
+def _plot(path: Path, study: Study[Any]) -> None:
+    from varpin.show.plots import plot_study  # noqa: PLC0415 - matplotlib is slow to import
+
+    save_figure(path, plot_study(study)[0])
 
 
 def _kept(request: argparse.Namespace, errors: Console, study: Callable[[Progress], Made]) -> Made:
@@ -155,22 +145,9 @@ def _kept(request: argparse.Namespace, errors: Console, study: Callable[[Progres
             return cast("Made", stop.record)
 
 
-def _show_kinds(record: Record) -> None:
-    """How many motions of each kind an integrator has."""
-    kinds, integrators = record.counts(), dict.fromkeys(cell.integrator for cell in record.runs)
-    found = {name: [cell.kind for cell in record.runs if cell.integrator == name] for name in integrators}
-    rows = [(name, *map(own.count, kinds)) for name, own in found.items()]
-    show(Table(f"{record.robot} at the extremes", ("integrator", *(kind.value for kind in kinds)), rows))
-    for kind, count in kinds.items():
-        show(f"{count} {kind.value}: {kind.meaning}")
-
-
-def _write(folder: Path | None, name: str, study: Study[Any], title: str, *, quiet: bool = False) -> None:
-    """Write the files of a study if there is a folder."""
-    if folder is None:
-        return
-    from varpin.show.study_report import write_report  # noqa: PLC0415 - matplotlib is slow to import
-
-    for path in write_report(folder, name, study, title):
-        if not quiet:
-            show(f"written: {path}")
+def _tell(request: argparse.Namespace, errors: Console, files: Writers, study: Study[Any], *texts: object) -> int:
+    """Print texts about a study and write its files; the exit status."""
+    written, trouble = write_all(request, errors, files, study)
+    if not request.quiet:
+        show("\n".join(map(str, [*texts, *("{}: {}".format(*row) for row in written)])))
+    return INTERRUPTED if study.missing else trouble

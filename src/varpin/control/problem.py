@@ -180,12 +180,10 @@ class OptimalControlProblem(Frozen):
         linear = controls == "linear"
         if hold != 1 and (linear or scene.inputs):
             what = "linear controls" if linear else "positions of a KinematicInput"
-            raise InputError(f"{what} are decided at every node: leave hold = {hold} out", "hold")
+            raise InputError(f"{what} are decided at every node: leave hold = {hold} out")
         if sampling != "gauss" and (linear or _cubic(scene)):
             what = "linear controls act" if linear else "a cubic KinematicInput acts"
-            raise InputError(
-                f"sampling = {sampling!r} misses the nodes, where {what}: leave it out, for 'gauss'", "sampling"
-            )
+            raise InputError(f"sampling = {sampling!r} misses the nodes, where {what}: leave it out, for 'gauss'")
         t0, names = finite("t0", t0), scene.robot.joint_names
         at, speed = joint_array("q0", q0, names), joint_array("v0", v0, names)
         if scene.constraints:
@@ -414,7 +412,7 @@ class OptimalControlProblem(Frozen):
             try:
                 bound.append(item.bind(horizon))
             except InputError as error:
-                error.argument = f"constraints[{i}]"
+                error.add_note(f"in constraints[{i}]")
                 raise
         return tuple(bound)
 

@@ -6,6 +6,7 @@ Equation (1.1) of the paper.
 from __future__ import annotations
 
 import logging
+import weakref
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -50,7 +51,6 @@ from varpin.model.tree import block_ends, mechanism, path_coordinates
 from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array, tuple_of
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
-from varpin.support.weak import Weak
 
 if TYPE_CHECKING:
     from varpin.mechanics.reduction import Required
@@ -451,13 +451,15 @@ class Scene(Frozen):
             gravity=self.gravity,
             forces=self.elements,
             couplings=self.couplings,
-            # The scene owns the functions of users.
+            # The scene owns the functions of users: the core's references are not seen by the garbage collector, and
+            # a function that refers to its scene would be a cycle for good.
             constraints=rows._replace(
                 customs=tuple(
-                    row._replace(value=Weak(row.value), curvature=Weak(row.curvature)) for row in rows.customs
+                    row._replace(value=weakref.proxy(row.value), curvature=weakref.proxy(row.curvature))
+                    for row in rows.customs
                 )
             ),
-            custom=None if self.custom is None else Weak(self.custom),
+            custom=None if self.custom is None else weakref.proxy(self.custom),
             actuation=self.actuation,
             constant=fields.constant,
             control=fields.control,

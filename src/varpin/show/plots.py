@@ -162,7 +162,7 @@ def _share_legend(figure: Figure, panels: NDArray[Any]) -> None:
         figure.legend(shared.values(), shared.keys(), loc="outside right upper", frameon=False, fontsize="small")
 
 
-def plot_study(study: Study[Any], axes: Axes | None = None, **options: str) -> Drawn:
+def plot_study(study: Study[Any], axes: Axes | None = None, *, quantity: str = "") -> Drawn:
     """What a study measured over time: a line for each method, circles on the Pareto front.
 
     A grey line marks the error of the reference.
@@ -170,8 +170,8 @@ def plot_study(study: Study[Any], axes: Axes | None = None, **options: str) -> D
     Args:
         study: From :func:`varpin.work_precision` or :func:`varpin.optimal_control_tradeoff`.
         axes: Where to draw; a new figure if left out.
-        options: For work and precision ``quantity``: ``"q"``, the largest error in q over the motion, or ``"energy"``,
-            that of the energy of a conservative motion. Errors below that of the reference are drawn on its line.
+        quantity: For work and precision ``"q"``, the largest error in q over the motion, or ``"energy"``, that of the
+            energy of a conservative motion. Errors below that of the reference are drawn on its line.
 
     Returns:
         The figure and its axes.
@@ -179,22 +179,26 @@ def plot_study(study: Study[Any], axes: Axes | None = None, **options: str) -> D
     Raises:
         InputError: Another ``study`` or ``quantity``, or no run has such a value.
     """
-    if not hasattr(study, "chart"):
+    if not hasattr(study, "quantities"):
         raise InputError(f"this figure is of a study, as from varpin.work_precision, got {type(study).__name__}")
-    chart = study.chart(**options)
-    if not chart.front:
+    labels, front = study.axes(quantity), study.pareto(quantity)
+    if not front:
         raise InputError("no run has such a value, so there is nothing to plot")
     figure, axes = _axes(axes)
-    for name in dict.fromkeys(name for name, _, _ in chart.points):
-        curve = [(seconds, value) for label, seconds, value in chart.points if label == name]
-        axes.plot(*zip(*curve, strict=True), label=name, marker="o", markersize=4, linewidth=_WIDTH)
+    for name in dict.fromkeys(run.integrator for run in study.runs):
+        runs = [run for run in study.runs if run.integrator == name]
+        values = [study.value_of(run, quantity) for run in runs]
+        seconds = [run.seconds for run in runs]
+        axes.plot(seconds, values, label=name, marker="o", markersize=4, linewidth=_WIDTH)
     ring: dict[str, Any] = {"marker": "o", "markersize": 9, "markerfacecolor": "none", "color": "0.3", "zorder": 1}
-    axes.plot(*zip(*chart.front, strict=True), label="Pareto front", linestyle="none", **ring)
-    axes.set(xscale="log", yscale="log" if chart.logarithmic else "linear")
-    for name, (axis, value) in chart.marks.items():
-        (axes.axvline if axis == "x" else axes.axhline)(value, label=name, **_MARK)
+    unbeaten = [run.seconds for run in front], [study.value_of(run, quantity) for run in front]
+    axes.plot(*unbeaten, label="Pareto front", linestyle="none", **ring)
+    axes.set(xscale="log", yscale="log" if study.logarithmic else "linear")
+    floor: float = getattr(study, "reference_error", 0.0)
+    if floor > 0.0 and quantity in ("", "q"):
+        axes.axhline(floor, label="error of the reference", **_MARK)
     axes.legend(frameon=False, fontsize="small")
-    axes.set(xlabel=chart.labels[0], ylabel=chart.labels[1])
+    axes.set(xlabel=labels[0], ylabel=labels[1])
     return figure, axes
 
 

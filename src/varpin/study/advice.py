@@ -11,10 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+import numpy as np
+
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Reference
 from varpin.mechanics.scene import Scene
-from varpin.simulation.tolerance import Ladder, Trial, first_steps
+from varpin.simulation.check import distance, repeated
+from varpin.simulation.tolerance import ROUNDING, Ladder, Trial, first_steps
 from varpin.study.motion import Setting, integrators_of
 from varpin.study.record import Study
 from varpin.support.checks import JointValues, positive
@@ -47,7 +50,7 @@ class Choice:
 
     def __str__(self) -> str:
         error = f"error {self.error:.1e}" if math.isfinite(self.error) else "unknown error"
-        return f"{self.integrator} at dt = {self.dt:.4g} s: {error} in {_time(self.seconds)}"
+        return f"{self.integrator} at dt = {self.dt:.4g} s: {error} in {self.seconds:.3g} s"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -86,7 +89,7 @@ class Advice(Study[Choice]):
         """Whether a choice was measured."""
         return "" if run.measured else "extrapolated"
 
-    def pareto(self) -> tuple[Choice, ...]:
+    def pareto(self, quantity: str = "") -> tuple[Choice, ...]:  # noqa: ARG002
         """The choice, if it meets the wish."""
         return (self.best,) if self.reached else ()
 
@@ -165,8 +168,14 @@ def advise(
 
 
 def _timed(setting: Setting, integrator: Integrator, steps: int) -> Trial:
-    """A trial and its wall time, the best of several short ones."""
-    return setting.trial(integrator, steps, repeats=_REPEATS, within=_TIMING)
+    """A trial: its wall time, the best of several short ones, and its error, from its repetition."""
+    outcome = setting.run(integrator, steps, repeats=_REPEATS, within=_TIMING)
+    motion, off = outcome.motion, math.inf
+    if not outcome.failure:
+        again = repeated(setting.scene, integrator, motion)
+        off = max(float(distance(again, motion)[0].max()), ROUNDING * max(1.0, float(np.abs(motion.q).max())))
+    whole = motion.statistics.split_steps == 0
+    return Trial(integrator, steps, off if math.isfinite(off) else math.inf, outcome.seconds, whole=whole)
 
 
 def _reason(
@@ -177,7 +186,7 @@ def _reason(
     duration: float,
 ) -> str:
     best = choices[0]
-    wish = f"an error of {tolerance:g} in q" if tolerance is not None else f"{_time(budget or 0.0)}"
+    wish = f"an error of {tolerance:g} in q" if tolerance is not None else f"{budget:g} s"
     if not reached:
         lines = [f"{wish} is not within reach of what was tried; the best is {best}"]
     else:
@@ -191,10 +200,3 @@ def _reason(
             f"{duration:g} s"
         )
     return "\n".join(lines)
-
-
-def _time(seconds: float) -> str:
-    for unit, size in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
-        if seconds >= size:
-            return f"{seconds / size:.3g} {unit}"
-    return f"{seconds:.2g} s"

@@ -105,15 +105,8 @@ def exact_motion(
 ) -> Exact | None:
     """The exact motion over a window, as far as a small disturbance does not grow; None where it has none.
 
-    Args:
-        scene: The scene.
-        q0: (n,) [rad or m].
-        v0: (n,) [rad/s or m/s].
-        u: Controls of each step (N, m).
-        dw: Increments of the Wiener processes (N, k).
-        dt: Time step [s].
-        left: As for :func:`path`.
-        ahead: Whole turns in q0, without which the motion is computed (n,) [rad].
+    Its steps of ``dt`` [s] have controls ``u`` (N, m) and increments ``dw`` (N, k), of which ``left`` is as for
+    :func:`path`; ``ahead`` (n,) are whole turns in q0, without which it is computed [rad].
     """
     if not len(u):
         return None

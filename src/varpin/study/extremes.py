@@ -28,7 +28,7 @@ from varpin.simulation.simulate import simulate
 from varpin.study.checks import LEVELS, condition, findings, finite, measures
 from varpin.study.exact import before_step, exact_motion
 from varpin.study.record import Progress, Study, collect
-from varpin.support.checks import positive
+from varpin.support.checks import positive, tuple_of
 from varpin.trajectory import Trajectory
 
 INTEGRATORS: tuple[Integrator, ...] = (
@@ -47,24 +47,21 @@ _STRUCTURE = ("record", "symplecticity")
 
 
 class Kind(Enum):
-    """The judgement of a motion; the value is its name in texts."""
+    """The judgement of a motion; the value is its name in texts, and ``meaning`` what it says."""
 
-    ACCURATE = "accurate"
-    DEGRADED = "degraded"
-    REFUSED = "refused"
-    STOPPED = "stopped"
-    WRONG = "silent wrong"
+    meaning: str
 
-    @property
-    def meaning(self) -> str:
-        """What it says, in words."""
-        return {
-            Kind.ACCURATE: "every check passes",
-            Kind.DEGRADED: "varpin warns that the result is inaccurate",
-            Kind.REFUSED: "a named error before the first step",
-            Kind.STOPPED: "a named error during the run; the motion up to there is kept",
-            Kind.WRONG: "a check fails, and varpin gives no warning",
-        }[self]
+    ACCURATE = "accurate", "every check passes"
+    DEGRADED = "degraded", "varpin warns that the result is inaccurate"
+    REFUSED = "refused", "a named error before the first step"
+    STOPPED = "stopped", "a named error during the run; the motion up to there is kept"
+    WRONG = "silent wrong", "a check fails, and varpin gives no warning"
+
+    def __new__(cls, word: str, meaning: str) -> Kind:
+        """A judgement by its name and meaning."""
+        kind = object.__new__(cls)
+        kind._value_, kind.meaning = word, meaning
+        return kind
 
 
 @dataclass(frozen=True)
@@ -90,18 +87,18 @@ class Cell:
 
     trial: str
     integrator: str
-    kind: Kind
-    error: float
-    joint: float
-    velocity: float
-    energy: float
-    symplecticity: float
-    record: float
-    said: tuple[str, ...]
-    found: tuple[str, ...]
-    done: int
-    steps: int
-    seconds: float
+    kind: Kind = Kind.REFUSED
+    error: float = math.nan
+    joint: float = math.nan
+    velocity: float = math.nan
+    energy: float = math.nan
+    symplecticity: float = math.nan
+    record: float = math.nan
+    said: tuple[str, ...] = ()
+    found: tuple[str, ...] = ()
+    done: int = 0
+    steps: int = 0
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -131,17 +128,13 @@ class Record(Study[Cell]):
     def notes(self) -> tuple[str, ...]:
         """What a reader of the table has to know."""
         return (
-            "errors: the largest distance in q from the exact motion, as a share of its travel; E: the largest error "
-            "of the energy balance, as a share of the energy that the motion exchanges",
+            "error: the largest distance in q from the exact motion, as a share of its travel; energy error: the "
+            "largest error of the energy balance, as a share of the energy that the motion exchanges",
         )
 
     def note(self, run: Cell) -> str:
         """The failed checks."""
         return "; ".join(run.found)
-
-    def pareto(self) -> tuple[Cell, ...]:
-        """None: accuracy is not set against time here."""
-        return ()
 
     def counts(self) -> dict[Kind, int]:
         """How many motions there are of each kind."""
@@ -242,8 +235,7 @@ def check_robot(
 
     It falls at steps from 1e-6 s to 0.5 s, turns fast and far, floats, hangs on stiff springs and dampers, is pushed to
     and fro, and trembles. Momenta and energies are held against Pinocchio's, q and v against LSODA's motion at 1e-11,
-    energy and momentum against their balance, symmetric methods against the way back, and the derivatives of
-    variational ones against A' J A = J.
+    energies against their balance, and the derivatives of variational methods against A' J A = J.
 
     Main args:
         robot: The robot, its name, or the path of its file.
@@ -258,12 +250,12 @@ def check_robot(
 
     Raises:
         RobotError: There is no such robot, or its file cannot be read.
-        InputError: ``patience`` is not positive.
+        InputError: ``patience`` is not positive, or ``integrators`` are none.
         StudyInterrupted: Ctrl-C; holds the motions so far. It is a KeyboardInterrupt.
     """
     arm = robot if isinstance(robot, Robot) else load_robot(robot)
     limit = positive("patience", patience, "s")
-    members = INTEGRATORS if integrators is None else integrators
+    members = INTEGRATORS if integrators is None else tuple_of("integrators", integrators, Integrator)
     jobs = [(motion, member) for motion in motions_of(arm) for member in members]
     cells = (cell(motion.name, partial(replace, motion), member, limit) for motion, member in jobs)
     return collect(Record((), arm.name), cells, len(jobs), progress)
@@ -271,39 +263,28 @@ def check_robot(
 
 def cell(name: str, build: Callable[[], Motion], integrator: Integrator, patience: float) -> Cell:
     """A motion with an integrator; errors of varpin refuse it, others are faults."""
-    begin, done, steps, said, wrong = time.perf_counter(), 0, 0, (), ()  # type: float, int, int, tuple[str, ...], tuple[str, ...]
-    found: dict[str, float] = {}
+    begin, made = time.perf_counter(), Cell(name, str(integrator))
     try:
         motion = build()
-        steps = motion.steps
-        trajectory, error = attempt(
-            patience, motion.scene, motion.q0, motion.v0, dt=motion.dt, steps=steps,
-            controls=motion.controls, increments=motion.increments, integrator=integrator,
-        )  # fmt: skip
+        made = replace(made, steps=motion.steps)
+        given = {"dt": motion.dt, "steps": motion.steps, "controls": motion.controls, "increments": motion.increments}
+        trajectory, error = attempt(patience, motion.scene, motion.q0, motion.v0, **given, integrator=integrator)
     except VarpinError as refusal:
-        kind, said = Kind.REFUSED, (line_of(refusal),)
+        made = replace(made, said=(line_of(refusal),))
     except Exception as fault:
-        kind, wrong = Kind.WRONG, (f"unnamed error: {line_of(fault)}",)
+        made = replace(made, kind=Kind.WRONG, found=(f"unnamed error: {line_of(fault)}",))
     else:
-        found, done = motion.measures(integrator, trajectory), trajectory.steps
-        kind, said, wrong = judge(trajectory, error, findings(found, condition(motion.scene, motion.q0)))
-    return Cell(
-        trial=name, integrator=str(integrator), kind=kind, said=said, found=wrong,
-        done=done, steps=steps, seconds=round(time.perf_counter() - begin, 3),
-        **dict.fromkeys(LEVELS, math.nan) | {name: found[name] for name in LEVELS if name in found},
-    )  # fmt: skip
+        measured = motion.measures(integrator, trajectory)
+        kind, said, wrong = judge(trajectory, error, findings(measured, condition(motion.scene, motion.q0)))
+        known: dict[str, Any] = {level: measured[level] for level in LEVELS if level in measured}
+        made = replace(made, kind=kind, said=said, found=wrong, done=trajectory.steps, **known)
+    return replace(made, seconds=round(time.perf_counter() - begin, 3))
 
 
 def judge(
     trajectory: Trajectory, error: VarpinError | None, wrong: tuple[str, ...]
 ) -> tuple[Kind, tuple[str, ...], tuple[str, ...]]:
-    """The kind of a motion, varpin's error and warnings, and the failed checks.
-
-    Args:
-        trajectory: The motion.
-        error: The error that ended it; None for a complete motion.
-        wrong: The failed checks.
-    """
+    """The kind of a motion, varpin's error, which ended it, and warnings, and the failed checks."""
     # These warnings are not about the steps that the checks judge.
     elsewhere = limits.KINDS
     warnings = (warning for warning in trajectory.warnings if warning.kind not in elsewhere)

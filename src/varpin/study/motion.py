@@ -9,8 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-import numpy as np
-
 from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.finding import announce
@@ -18,11 +16,10 @@ from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.signals.commands import held_in_parts
 from varpin.signals.controls import control_rows
-from varpin.simulation.check import distance, repeated
 from varpin.simulation.failures import StepFailure
 from varpin.simulation.simulate import simulate
 from varpin.simulation.start import on_constraints
-from varpin.simulation.tolerance import ROUNDING, Trial, candidates
+from varpin.simulation.tolerance import candidates
 from varpin.support.checks import JointValues, joint_array, positive, tuple_of
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
@@ -80,11 +77,10 @@ class Setting(Frozen):
 
     def run(self, integrator: Integrator, steps: int, *, repeats: int = 0, within: float = math.inf) -> Outcome:
         """The motion in ``steps`` steps, a multiple of R; arguments for the time as for :func:`fastest`."""
-        (motion, failure), seconds = fastest(lambda: self._timed(integrator, steps), repeats, within)
+        (motion, failure), seconds = fastest(lambda: self._once(integrator, steps), repeats, within)
         return Outcome(motion, failure, seconds)
 
-    def _timed(self, integrator: Integrator, steps: int) -> tuple[tuple[Trajectory, str], float]:
-        """The motion once, why it failed, and its time [s]."""
+    def _once(self, integrator: Integrator, steps: int) -> tuple[tuple[Trajectory, str], float]:
         scene, R, failure = self.scene, len(self.controls), ""
         rows = held_in_parts(scene, self.controls, self.q0, self.v0, self.duration / R, steps // R)
         options: dict[str, Any] = {"dt": self.duration / steps, "steps": steps, "controls": rows, "check": False}
@@ -95,27 +91,12 @@ class Setting(Frozen):
             motion, failure = error.trajectory, error.problem
         return (motion, failure), time.perf_counter() - begin
 
-    def trial(self, integrator: Integrator, steps: int, *, repeats: int = 0, within: float = math.inf) -> Trial:
-        """A run and its error, from its repetition by a better method, as a trial of a ladder."""
-        outcome = self.run(integrator, steps, repeats=repeats, within=within)
-        motion, off = outcome.motion, math.inf
-        if not outcome.failure:
-            again = repeated(self.scene, integrator, motion)
-            off = max(float(distance(again, motion)[0].max()), ROUNDING * max(1.0, float(np.abs(motion.q).max())))
-        whole = motion.statistics.split_steps == 0
-        return Trial(integrator, steps, off if math.isfinite(off) else math.inf, outcome.seconds, whole=whole)
-
 
 def fastest(run: Callable[[], tuple[Result, float]], repeats: int, within: float = math.inf) -> tuple[Result, float]:
-    """The result and the time [s] of the fastest of several runs.
+    """The result and the time [s] of the fastest of several runs; 0 ``repeats`` are the first alone.
 
     The first run finds caches cold and a processor at rest: it does not count unless it is so long that this is
-    nothing.
-
-    Args:
-        run: Makes a run; returns its result and time.
-        repeats: How many count; 0 for the first alone.
-        within: Time after which none is begun if one counts [s].
+    nothing. None is begun after the time ``within`` [s] if one counts.
     """
     begin, first = time.perf_counter(), run()
     counted = [first] if not repeats or first[1] >= min(_LONG, within) else []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 from varpin.control import OptimalControlProblem, Solution, solve
@@ -13,7 +13,7 @@ from varpin.control.problem import require_problem
 from varpin.errors import InputError
 from varpin.integrators import Integrator
 from varpin.study.motion import fastest, integrators_of
-from varpin.study.record import Chart, Progress, Study, collect, pareto_front
+from varpin.study.record import Progress, Study, collect
 from varpin.support.checks import count, positive
 
 _COSTS = ("planned_cost", "open_loop_cost", "closed_loop_cost", "accuracy")
@@ -44,13 +44,13 @@ class OptimalControlRun:
     dt: float
     steps: int
     hold: int
-    seconds: float
-    iterations: int
-    planned_cost: float
-    open_loop_cost: float
-    closed_loop_cost: float
-    accuracy: float
-    status: str
+    seconds: float = math.nan
+    iterations: int = 0
+    planned_cost: float = math.nan
+    open_loop_cost: float = math.nan
+    closed_loop_cost: float = math.nan
+    accuracy: float = math.nan
+    status: str = ""
     failure: str = ""
 
 
@@ -65,6 +65,8 @@ class OptimalControlTradeoff(Study[OptimalControlRun]):
 
     headings: ClassVar = {"seconds": "solve time [s]"}
     shown: ClassVar = ("integrator", "dt", "seconds", "planned_cost", "open_loop_cost", "closed_loop_cost")
+    quantities: ClassVar = {"cost": "open_loop_cost"}
+    logarithmic: ClassVar = False
 
     duration: float
 
@@ -78,19 +80,7 @@ class OptimalControlTradeoff(Study[OptimalControlRun]):
 
     def note(self, run: OptimalControlRun) -> str:
         """Whether a run is on the front, or how it ended otherwise."""
-        if run.failure:
-            return "failed"
-        return "Pareto" if run in self.pareto() else "" if run.status == "converged" else run.status
-
-    def chart(self) -> Chart:
-        """True cost of the controls over solve time."""
-        points = [(run.integrator, run.seconds, run.open_loop_cost) for run in self.runs]
-        front = [(run.seconds, run.open_loop_cost) for run in self.pareto()]
-        return Chart(points, front, ("solve time [s]", "true cost of the controls"), logarithmic=False)
-
-    def pareto(self) -> tuple[OptimalControlRun, ...]:
-        """The runs than which no other is better in both solve time and true open-loop cost, from the fastest up."""
-        return pareto_front(self.runs, lambda run: run.seconds, lambda run: run.open_loop_cost)
+        return super().note(run) or ("" if run.status == "converged" else run.status)
 
 
 def optimal_control_tradeoff(
@@ -152,19 +142,15 @@ def _solved(problem: OptimalControlProblem, options: dict[str, Any]) -> tuple[So
 
 
 def _measured(problem: OptimalControlProblem, repeats: int, options: dict[str, Any]) -> OptimalControlRun:
-    costs = dict.fromkeys(_COSTS, math.nan)
-    seconds, iterations, status, failure = math.nan, 0, "", ""
+    run = OptimalControlRun(str(problem.integrator), problem.integrator.order, problem.dt, problem.steps, problem.hold)
     # An error of one run, whatever it is, does not stop the others.
     try:
-        solution, best = fastest(lambda: _solved(problem, options), repeats)
+        solution, seconds = fastest(lambda: _solved(problem, options), repeats)
         truth = solution.verify()
-        costs = {name: getattr(truth, name) for name in costs}
-        seconds, iterations, status = best, solution.iterations, solution.status.name.lower()
     except InputError:
         raise
     except Exception as error:
-        failure = f"{type(error).__name__}: {error}"
-    return OptimalControlRun(
-        str(problem.integrator), problem.integrator.order, problem.dt, problem.steps, problem.hold, seconds,
-        iterations, **costs, status=status, failure=failure,
-    )  # fmt: skip
+        return replace(run, failure=f"{type(error).__name__}: {error}")
+    costs = {name: getattr(truth, name) for name in _COSTS}
+    status = solution.status.name.lower()
+    return replace(run, seconds=seconds, iterations=solution.iterations, status=status, **costs)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,13 +13,11 @@ from varpin.arrays import Floats
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Gauss, Integrator, Reference
 from varpin.mechanics.scene import Scene, require_scene
-from varpin.simulation.check import repeated
-from varpin.simulation.tolerance import ROUNDING, SENSIBLE, Ladder, Trial, first_steps
+from varpin.signals.commands import held_in_parts
+from varpin.simulation.tolerance import ROUNDING, steps_for_tolerance
 from varpin.study.motion import Setting, integrators_of
-from varpin.study.record import Chart, Progress, Study, collect, pareto_front
-from varpin.support.checks import JointValues, count, positive, word
-
-Quantity = Literal["q", "energy"]
+from varpin.study.record import Progress, Study, collect
+from varpin.support.checks import JointValues, count, positive
 
 # The largest of the steps where none are named [s], and the number of its halvings: down to 0.16 ms, from which on
 # methods of fourth order are at the rounding of an arm's motion.
@@ -29,8 +27,8 @@ _COARSEST, _HALVINGS = 0.04, 8
 _SAMPLES = 64
 # The reference, and the one that tells its error.
 _EXACT, _LOOSER = Reference(rtol=1e-13), Reference(rtol=1e-12)
-# The reference under constraints, which ``Reference`` does not keep, and its most steps.
-_CONSTRAINED, _MOST = Gauss(4), 2**18
+# The reference under constraints, which ``Reference`` does not keep.
+_CONSTRAINED = Gauss(4)
 
 
 @dataclass(frozen=True)
@@ -56,13 +54,13 @@ class WorkPrecisionRun:
     order: int
     dt: float
     steps: int
-    seconds: float
-    error: float
-    energy_error: float
-    newton_iterations: int
-    jets: int
-    sweeps: int
-    split_steps: int
+    seconds: float = math.nan
+    error: float = math.nan
+    energy_error: float = math.nan
+    newton_iterations: int = 0
+    jets: int = 0
+    sweeps: int = 0
+    split_steps: int = 0
     failure: str = ""
 
 
@@ -81,6 +79,7 @@ class WorkPrecision(Study[WorkPrecisionRun]):
     """
 
     shown: ClassVar = ("integrator", "dt", "seconds", "error", "energy_error")
+    quantities: ClassVar = {"q": "error", "energy": "energy_error"}
 
     duration: float
     reference: str
@@ -99,8 +98,8 @@ class WorkPrecision(Study[WorkPrecisionRun]):
 
     def note(self, run: WorkPrecisionRun) -> str:
         """Whether a run is on the front, failed, or has divided steps."""
-        marks = ["failed"] if run.failure else ["Pareto"] if run in self.pareto() else []
-        return "; ".join([*marks, *([f"{run.split_steps} split"] if run.split_steps else [])])
+        split = f"{run.split_steps} split" if run.split_steps else ""
+        return "; ".join(filter(None, (super().note(run), split)))
 
     def row(self, run: WorkPrecisionRun) -> tuple[str, ...]:
         """A run as entries of the columns that screens show."""
@@ -109,28 +108,14 @@ class WorkPrecision(Study[WorkPrecisionRun]):
             texts["error"] = f"<{self.reference_error:.3g}"
         return tuple(texts.values())
 
-    def error_of(self, run: WorkPrecisionRun, quantity: Quantity = "q") -> float:
-        """The error of a run, not below what the reference can tell; energy errors need no reference."""
-        word("quantity", quantity, ("q", "energy"))
-        error, floor = (run.error, self.reference_error) if quantity == "q" else (run.energy_error, 0.0)
-        return max(error, floor) if math.isfinite(error) else math.nan
-
-    def chart(self, quantity: Quantity = "q") -> Chart:
-        """An error over wall time: ``"q"``, or ``"energy"`` of a conservative motion."""
-        names = {"q": "largest error in q [rad or m]", "energy": "largest energy error [J]"}
-        front = [(run.seconds, self.error_of(run, quantity)) for run in self.pareto(quantity)]
-        points = [(run.integrator, run.seconds, self.error_of(run, quantity)) for run in self.runs]
-        known = quantity == "q" and self.reference_error > 0.0
-        marks = {"error of the reference": ("y", self.reference_error)} if known else {}
-        return Chart(points, front, (f"wall time for {self.duration:g} s [s]", names[quantity]), marks=marks)
+    def value_of(self, run: WorkPrecisionRun, quantity: str = "q") -> float:
+        """An error of a run, that of q not below what the reference can tell; energy errors need no reference."""
+        found = super().value_of(run, quantity)
+        return max(found, self.reference_error) if quantity == "q" and math.isfinite(found) else found
 
     def at_floor(self, run: WorkPrecisionRun) -> bool:
         """Whether the error of a run in q is too small for the reference to tell."""
         return run.error <= self.reference_error
-
-    def pareto(self, quantity: Quantity = "q") -> tuple[WorkPrecisionRun, ...]:
-        """The runs than which no other is both faster and more accurate, from the fastest up."""
-        return pareto_front(self.runs, lambda run: run.seconds, lambda run: self.error_of(run, quantity))
 
 
 def work_precision(
@@ -174,11 +159,11 @@ def work_precision(
     jobs = [(member, steps) for member in members for steps in grids]
     samples = _samples(grids, len(setting.controls))
     if scene.constraints:
-        text, exact, other = f"{_CONSTRAINED} in ever smaller steps", *_constrained(setting, samples)
+        text, exact, error = f"{_CONSTRAINED} in ever smaller steps", *_constrained(setting, samples)
     else:
         # Over short intervals both may take the same steps and agree, exact or not: halved they do not.
-        text, exact, other = str(_EXACT), _by(setting, _EXACT, 2 * samples)[::2], _by(setting, _LOOSER, samples)
-    error = float(np.abs(exact - other).max())
+        text, exact = str(_EXACT), _by(setting, _EXACT, 2 * samples)[::2]
+        error = float(np.abs(exact - _by(setting, _LOOSER, samples)).max())
     base = WorkPrecision((), scene.robot.name, setting.duration, text, error, samples)
     return collect(base, (_measure(setting, exact, repeats, *job) for job in jobs), len(jobs), progress)
 
@@ -191,22 +176,13 @@ def _by(setting: Setting, reference: Reference, samples: int) -> Floats:
     return outcome.motion.q
 
 
-def _constrained(setting: Setting, samples: int) -> tuple[Floats, Floats]:
-    """A motion under constraints (K + 1, n) in steps that leave nothing but rounding, and its repetition."""
-    first = samples * math.ceil(first_steps(setting.scene, setting.q0, setting.v0, setting.duration, 1) / samples)
-    taken = [0]
-
-    def trial(member: Integrator, steps: int) -> Trial:
-        taken.append(steps)
-        return setting.trial(member, steps)
-
-    ladder = Ladder(trial, [_CONSTRAINED], first, samples, lambda: taken[-1] > _MOST)
-    best = ladder.for_tolerance(ROUNDING * max(1.0, float(np.abs(setting.q0).max())))[0][0]
-    if not best.error < SENSIBLE:
-        raise VarpinError("no steps are small enough for a reference of this motion")
-    motion = setting.run(_CONSTRAINED, best.steps).motion
-    stride = best.steps // samples
-    return motion.q[::stride], repeated(setting.scene, _CONSTRAINED, motion)[0][::stride]
+def _constrained(setting: Setting, samples: int) -> tuple[Floats, float]:
+    """A motion under constraints (K + 1, n) in steps that leave nothing but rounding, and its error."""
+    scene, start, parts = setting.scene, (setting.q0, setting.v0), samples // len(setting.controls)
+    rows = held_in_parts(scene, setting.controls, *start, setting.duration * parts / samples, parts)
+    found = steps_for_tolerance(scene, *start, setting.duration, ROUNDING, rows, _CONSTRAINED)
+    motion = setting.run(_CONSTRAINED, found.steps).motion
+    return motion.q[:: found.steps // samples], float(found.error.max())
 
 
 def _grids(setting: Setting, dts: Sequence[float] | None) -> list[int]:
@@ -235,21 +211,17 @@ def _samples(grids: Sequence[int], rows: int) -> int:
 
 def _measure(setting: Setting, exact: Floats, repeats: int, member: Integrator, steps: int) -> WorkPrecisionRun:
     """A run against the exact motion (K + 1, n)."""
-    error = energy = seconds = math.nan
-    counts, failure = (0, 0, 0, 0), ""
+    run = WorkPrecisionRun(str(member), member.order, setting.duration / steps, steps)
     # An error of one run, whatever it is, does not stop the others.
     try:
         outcome = setting.run(member, steps, repeats=repeats)
     except Exception as reason:
-        failure = f"{type(reason).__name__}: {reason}"
-    else:
-        failure, motion, own = outcome.failure, outcome.motion, outcome.motion.statistics
-        counts = int(own.newton_iterations.sum()), int(own.jets.sum()), int(own.sweeps.sum()), own.split_steps
-        if not failure:
-            seconds = outcome.seconds
-            error = float(np.abs(motion.q[:: steps // (len(exact) - 1)] - exact).max())
-            if setting.conservative:
-                energy = float(np.abs(motion.energy - motion.energy[0]).max())
-    return WorkPrecisionRun(
-        str(member), member.order, setting.duration / steps, steps, seconds, error, energy, *counts, failure
-    )
+        return replace(run, failure=f"{type(reason).__name__}: {reason}")
+    motion, own = outcome.motion, outcome.motion.statistics
+    counts: dict[str, Any] = {name: int(getattr(own, name).sum()) for name in ("newton_iterations", "jets", "sweeps")}
+    run = replace(run, **counts, split_steps=own.split_steps, failure=outcome.failure)
+    if run.failure:
+        return run
+    error = float(np.abs(motion.q[:: steps // (len(exact) - 1)] - exact).max())
+    change = float(np.abs(motion.energy - motion.energy[0]).max()) if setting.conservative else math.nan
+    return replace(run, seconds=outcome.seconds, error=error, energy_error=change)

@@ -8,12 +8,14 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, cast
 
 from varpin.errors import InputError
 from varpin.io.archive import atomic_file
 from varpin.support import markup
+from varpin.support.checks import is_one_of
 from varpin.support.tables import Table, csv_text
 
 Row = TypeVar("Row")
@@ -32,18 +34,6 @@ _HEADINGS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Chart:
-    """What a study's figure shows: a quantity over time."""
-
-    points: Sequence[tuple[str, float, float]]  # method, wall time [s] and value of each run
-    front: Sequence[tuple[float, float]]  # wall time [s] and value of the runs on the Pareto front
-    labels: tuple[str, str]  # of the two axes
-    # Values to mark, by name: the axis, x or y, and the value.
-    marks: Mapping[str, tuple[str, float]] = field(default_factory=dict)
-    logarithmic: bool = True  # whether the values are
-
-
-@dataclass(frozen=True, eq=False)
 class Study(Generic[Row]):
     """Runs of one motion, one problem or one robot.
 
@@ -56,6 +46,9 @@ class Study(Generic[Row]):
     # The attributes of a run that screens and pages show, and headings of this study's own.
     shown: ClassVar[Sequence[str]]
     headings: ClassVar[Mapping[str, str]] = {}
+    # The attributes that are set against wall time, by the words of ``quantity=``.
+    quantities: ClassVar[Mapping[str, str]] = {}
+    logarithmic: ClassVar[bool] = True  # whether a figure shows them so
 
     runs: tuple[Row, ...]
     robot: str
@@ -81,17 +74,31 @@ class Study(Generic[Row]):
         """What a reader of the table has to know, in sentences."""
         raise NotImplementedError
 
-    def pareto(self) -> tuple[Row, ...]:
-        """The runs than which no other is better in both columns, from the fastest up."""
-        raise NotImplementedError
+    def value_of(self, run: Row, quantity: str = "") -> float:
+        """A ``quantity`` of a run that is set against its wall time, the first if left out; NaN where it failed."""
+        return float(getattr(run, self._attribute(quantity)))
 
-    def chart(self) -> Chart:
-        """What the figure shows; raises an InputError if there is none."""
-        raise InputError(f"a {type(self).__name__} has no figure")
+    def pareto(self, quantity: str = "") -> tuple[Row, ...]:
+        """The runs than which no other has both a smaller wall time and a smaller quantity, from the fastest up."""
+        if not (quantity or self.quantities):
+            return ()
+        return pareto_front(self.runs, attrgetter("seconds"), lambda run: self.value_of(run, quantity))
+
+    def axes(self, quantity: str = "") -> tuple[str, str]:
+        """Labels of a figure; raises an InputError if there is none."""
+        return self._heading("seconds"), self._heading(self._attribute(quantity))
+
+    def _attribute(self, quantity: str) -> str:
+        if not self.quantities:
+            raise InputError(f"a {type(self).__name__} has no figure")
+        words = tuple(self.quantities)
+        if quantity and not is_one_of(quantity, words):
+            raise InputError(f"quantity must be {' or '.join(map(repr, words))}, got {quantity!r}")
+        return self.quantities[quantity or words[0]]
 
     def note(self, run: Row) -> str:
         """The last column of a run."""
-        return "failed" if getattr(run, "failure", "") else ""
+        return "failed" if getattr(run, "failure", "") else "Pareto" if run in self.pareto() else ""
 
     def columns(self) -> tuple[str, ...]:
         """The headings of the columns that screens show."""
@@ -108,12 +115,8 @@ class Study(Generic[Row]):
         return Table(title, self.columns(), [self.row(run) for run in self.runs], strong)
 
     def _repr_html_(self) -> str:
-        return self.html()
-
-    def html(self, **rows: int) -> str:
-        """The runs and what a reader has to know as HTML; ``most=`` runs."""
         runs = self.table()
-        table = markup.table(runs.columns, runs.rows, runs.strong, **rows)
+        table = markup.table(runs.columns, runs.rows, runs.strong)
         return markup.facts(repr(self), [("", note) for note in (*self.notes, *self.failures)], table)
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
@@ -145,17 +148,7 @@ class StudyInterrupted(KeyboardInterrupt):
 
 
 def collect(base: Made, runs: Generator[Any, None, None], total: int, progress: Progress | None) -> Made:
-    """A study with all of its runs, which are measured one by one.
-
-    Args:
-        base: The study without runs.
-        runs: Measures the runs.
-        total: Their number.
-        progress: Called with (runs done, runs in all) after each.
-
-    Raises:
-        StudyInterrupted: Ctrl-C.
-    """
+    """The study ``base`` with its runs, which are measured one by one; raises StudyInterrupted at Ctrl-C."""
     done: list[Any] = []
     try:
         with closing(runs):

@@ -50,14 +50,7 @@ def rotation_matrix(name: str, value: ArrayLike) -> Floats:
 def tuple_of(name: str, given: Any, kind: type, note: str = "") -> tuple[Any, ...]:
     """``given``, an object of type ``kind`` or a sequence of them, as a tuple.
 
-    Args:
-        name: Plural of the type, for the error.
-        given: The object or sequence.
-        kind: The type.
-        note: End of the message, where other objects have the same name.
-
-    Raises:
-        InputError: ``given`` is neither, or one of the entries has another type.
+    The ``name`` is the plural of the type; a ``note`` ends messages, where other objects have the same name.
     """
     found = (given,) if isinstance(given, kind) and kind is not str else given
     wanted = f"{name} must be a list" if kind is str else f"{name} must be a list of varpin's {name}"

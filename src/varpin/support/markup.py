@@ -1,20 +1,12 @@
-"""HTML: tables of objects in a notebook, and pages of reports. Plain text is escaped here."""
+"""HTML: tables of objects in a notebook. Plain text is escaped here."""
 
 from __future__ import annotations
 
-import base64
 import html
 from collections.abc import Iterable, Sequence
 
 # Largest number of rows of a table, and of names in a list.
 _MOST = 50
-
-_PAGE_STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
-table { border-collapse: collapse; margin: 1rem 0; font-size: 0.85rem; }
-td, th { border: 1px solid #ccc; padding: 0.25rem 0.6rem; }
-img { max-width: 100%; }
-"""
 
 _LEFT, _RIGHT = "text-align: left; vertical-align: top", "text-align: right; vertical-align: top"
 
@@ -28,21 +20,19 @@ def facts(title: str, rows: Iterable[tuple[str, object]], *parts: str) -> str:
     return f'<div class="varpin"><b>{_text(title)}</b><table>{body}</table>{"".join(parts)}</div>'
 
 
-def table(
-    columns: Sequence[str], rows: Iterable[Sequence[object]], strong: Iterable[int] = (), *, most: int = _MOST
-) -> str:
-    """The first ``most`` rows under headings, text to the left, numbers to the right; those in ``strong`` are bold."""
+def table(columns: Sequence[str], rows: Iterable[Sequence[object]], strong: Iterable[int] = ()) -> str:
+    """The first rows under headings, text to the left, numbers to the right; those in ``strong`` are bold."""
     every, bold = list(rows), set(strong)
     head = "".join(f'<th style="{_LEFT}">{_text(name)}</th>' for name in columns)
     body = ""
-    for k, row in enumerate(every[:most]):
+    for k, row in enumerate(every[:_MOST]):
         cells = ""
         for value in row:
             inner = f"<b>{_text(value)}</b>" if k in bold else _text(value)
             cells += f'<td style="{_LEFT if isinstance(value, str) else _RIGHT}">{inner}</td>'
         body += f"<tr>{cells}</tr>"
-    if len(every) > most:
-        body += f'<tr><td colspan="{len(columns)}" style="{_LEFT}">and {len(every) - most} more</td></tr>'
+    if len(every) > _MOST:
+        body += f'<tr><td colspan="{len(columns)}" style="{_LEFT}">and {len(every) - _MOST} more</td></tr>'
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
@@ -66,18 +56,3 @@ def _text(value: object) -> str:
 def warning_count(warnings: Sequence[str]) -> str:
     """The number of warnings as a part of a line; empty if there are none."""
     return f", {len(warnings)} warning{'s' * (len(warnings) > 1)}" if warnings else ""
-
-
-def page(title: str, body: str) -> str:
-    """A complete page with a title and a body (HTML)."""
-    return f"""<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{_text(title)}</title><style>{_PAGE_STYLE}</style></head>
-<body><h1>{_text(title)}</h1>
-{body}
-</body></html>
-"""
-
-
-def picture(png: bytes, caption: str) -> str:
-    """A picture inside a page."""
-    return f'<img alt="{_text(caption)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'

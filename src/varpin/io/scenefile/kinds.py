@@ -60,7 +60,7 @@ PLAN_CONSTRAINTS: Mapping[str, Callable[..., plan.PlanConstraint]] = {
 OBSTACLES: Mapping[str, Callable[..., Obstacle]] = {
     name: getattr(Obstacle, name) for name in ("sphere", "capsule", "box", "convex", "mesh")
 }
-COSTS: Mapping[str, Callable[..., Cost]] = {
+COSTS: Mapping[str, type[Cost]] = {
     "tracking": costs.TrackingCost,
     "velocity": costs.VelocityCost,
     "control": costs.ControlCost,
@@ -73,6 +73,7 @@ COSTS: Mapping[str, Callable[..., Cost]] = {
     "joint_limits": costs.JointLimitBarrier,
     "velocity_limits": costs.VelocityLimitBarrier,
 }
+COST_WORDS = {kind: word for word, kind in COSTS.items()}
 # Costs whose components are joints, or controls; and names of the components of others: weights, and targets.
 OF_JOINTS = ("tracking", "velocity", "joint_limits", "velocity_limits")
 OF_CONTROLS = ("control", "control_rate")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import inspect
 import re
 import reprlib
@@ -16,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.errors import FileError, InputError, VarpinError
+from varpin.errors import FileError, InputError, VarpinError, suggestion
 from varpin.model import Robot, looks_like_degrees
 from varpin.support.checks import finite, is_file
 
@@ -88,17 +87,24 @@ class Where:
             raise self.error(f"must be a table, got {_shown(given)}")
         for name in given:
             if keys is not None and name not in keys:
-                raise self.at(name).error(f"unknown key; {_suggestion(name, keys, 'keys')}")
+                raise self.at(name).error(f"unknown key; {suggestion(name, keys, 'keys', _NAMED)}")
         for name in required:
             if name not in given:
                 raise self.at(name).error("is missing")
         return given
 
-    def tables(self, given: Any) -> list[tuple[Where, Any]]:
-        """The tables of a list, each with its place."""
-        if not isinstance(given, list):
-            raise self.error(f"must be a list of tables, written [[{self.key}]], got {_shown(given)}")
-        return [(self.at(index), entry) for index, entry in enumerate(given)]
+    def tables(self, given: Mapping[str, Any], name: str) -> list[tuple[Where, Any]]:
+        """The tables of a list under a key, each with its place; none where the key is left out."""
+        at, found = self.at(name), given.get(name, [])
+        if not isinstance(found, list):
+            raise at.error(f"must be a list of tables, written [[{at.key}]], got {_shown(found)}")
+        return [(at.at(index), entry) for index, entry in enumerate(found)]
+
+    def entries(
+        self, given: Mapping[str, Any], name: str, kinds: Mapping[str, _T]
+    ) -> list[tuple[Where, str, _T, dict[str, Any]]]:
+        """The tables of a list under a key: the place of each, and what :meth:`kind` tells of it."""
+        return [(place, *place.kind(entry, kinds)) for place, entry in self.tables(given, name)]
 
     def call(self, make: Callable[..., _T], given: Any, without: Collection[str] = (), **others: Any) -> _T:
         """What a function of the API makes of the keys of a table and of ``others``; ``without`` are none."""
@@ -117,7 +123,7 @@ class Where:
     def one_of(self, given: Any, words: Iterable[str]) -> str:
         """One of some words."""
         if not isinstance(given, str) or given not in (words := list(words)):
-            raise self.error(f"there is no {_shown(given)}; {_suggestion(str(given), words, 'allowed')}")
+            raise self.error(f"there is no {_shown(given)}; {suggestion(str(given), words, 'allowed', _NAMED)}")
         return given
 
     def check(self, check: Callable[..., _T], given: Any, *options: Any) -> _T:
@@ -147,7 +153,7 @@ class Where:
         if isinstance(given, Mapping):
             for name in given:
                 if name not in names:
-                    raise self.at(name).error(f"there is no such {what}; {_suggestion(name, names, what + 's')}")
+                    raise self.at(name).error(f"there is no such {what}; {suggestion(name, names, what + 's', _NAMED)}")
             found = {name: self.at(name).check(finite, value) for name, value in given.items()}
             return np.array([found.get(name, 0.0) for name in names], dtype=np.float64)
         if not isinstance(given, list):
@@ -179,22 +185,13 @@ def _shown(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else reprlib.repr(value)
 
 
-def _suggestion(word: str, names: Iterable[str], what: str) -> str:
-    """A hint with similar names, and the list of names."""
-    names = tuple(names)
-    matches = difflib.get_close_matches(word, names, n=2, cutoff=0.5)
-    hint = f"did you mean {' or '.join(map(repr, matches))}? " if matches else ""
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return f"{hint}{what}: {', '.join(names[:_NAMED]) or 'none'}{more}"
-
-
 def find_scene(source: str | Path, bundled: Mapping[str, Path]) -> Path:
     """The scene file at a path, or the bundled one of that name."""
     if not isinstance(source, str | Path) or "\0" in str(source):
         raise InputError(f"a scene must be the path of a TOML file or a name, got {type(source).__name__}")
     path = bundled.get(str(source), Path(source).expanduser())
     if not is_file(path):
-        raise FileError(f"no scene file {str(source)!r}; {_suggestion(path.stem, bundled, 'bundled scenes')}")
+        raise FileError(f"no scene file {str(source)!r}; {suggestion(path.stem, bundled, 'bundled scenes', _NAMED)}")
     return path
 
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Integers
 from varpin.errors import FileError, InputError
 from varpin.io.archive import read_npz
 from varpin.io.scenefile.reading import Where
@@ -35,155 +36,108 @@ class Timeline:
         row: Floats = self.at(np.array([time]))[0]
         return row
 
-    def columns(self, keep: Sequence[int]) -> Timeline:
-        """Some of the components."""
-        return Timeline(_Columns(self.at, np.array(keep, dtype=np.int64)), self.constant)
+
+# Functions of time are parts of functions of this module, because closures cannot be pickled.
+def _columns(of: Timeline, keep: Integers | slice, t: Floats) -> Floats:
+    return of.at(t)[:, keep]
 
 
-def constant(values: Floats) -> Timeline:
-    """The same values at all times."""
-    return Timeline(_Sines(values), True)
+def _waves(offset: Floats, waves: Sequence[tuple[int, float, float, float]], t: Floats) -> Floats:
+    total = np.tile(offset, (len(t), 1))
+    for column, amplitude, frequency, phase in waves:
+        total[:, column] += amplitude * np.sin(2.0 * math.pi * frequency * t + phase)
+    return total
 
 
-# Functions of time are classes, because closures cannot be pickled.
+def _lines(times: Floats, rows: Floats, t: Floats) -> Floats:
+    return np.column_stack([np.interp(t, times, column) for column in rows.T])
 
 
-@dataclass(frozen=True, eq=False)
-class _Columns:
-    of: Callable[[Floats], Floats]
-    index: NDArray[np.int64]
-
-    def __call__(self, t: Floats) -> Floats:
-        return self.of(t)[:, self.index]
-
-
-@dataclass(frozen=True, eq=False)
-class _Sines:
-    offset: Floats
-    sines: tuple[tuple[int, Sine], ...] = ()
-
-    def __call__(self, t: Floats) -> Floats:
-        total = np.tile(self.offset, (len(t), 1))
-        for column, sine in self.sines:
-            total[:, column] += sine.amplitude * np.sin(2.0 * math.pi * sine.frequency * t + sine.phase)
-        return total
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Rows over time, by straight lines or a curve; outside the first and the last row."""
-
-    times: Floats
-    rows: Floats
-    curve: scipy.interpolate.PchipInterpolator | None = None
-
-    def __call__(self, t: Floats) -> Floats:
-        if self.curve is not None:
-            return np.asarray(self.curve(np.clip(t, self.times[0], self.times[-1])))
-        return np.column_stack([np.interp(t, self.times, column) for column in self.rows.T])
+def _curve(times: Floats, curve: scipy.interpolate.PchipInterpolator, t: Floats) -> Floats:
+    return np.asarray(curve(np.clip(t, times[0], times[-1])))
 
 
 @dataclass(frozen=True)
-class Sine:
-    """amplitude sin(2 pi frequency t + phase), added to the component ``of``."""
+class Reader:
+    """What the values of a reference are of."""
 
-    of: str
-    amplitude: float
-    frequency: float
-    phase: float = 0.0
-
-    def __post_init__(self) -> None:
-        finite("amplitude", self.amplitude)
-        finite("phase", self.phase)
-        positive("frequency", self.frequency, "Hz")
+    where: Where
+    robot: Robot  # of the file, whose postures have names
+    names: Sequence[str]  # the components
+    what: str  # one of them, in a word
+    dt: float  # time step [s]
+    end: float  # of the horizon [s]
 
 
-@dataclass(frozen=True)
-class Sines:
-    """A reference of sines."""
-
-    sines: Any = ()
-    offset: Any = 0.0
-
-    def timeline(self, where: Where, names: Sequence[str], what: str, horizon: tuple[float, float]) -> Timeline:
-        """The sines about their offset; the horizon is the step and the duration [s]."""
-        offset, found, (dt, _) = where.at("offset").numbers(self.offset, names, what), [], horizon
-        for place, given in where.at("sines").tables(self.sines):
-            sine = place.call(Sine, given)
-            place.at("of").one_of(sine.of, names)
-            if sine.frequency > 0.5 / dt:
-                most = f"<= {0.5 / dt:g} [Hz], the most that dt = {dt:g} s resolves"
-                raise place.at("frequency").error(f"must be {most}, got {sine.frequency:g}")
-            found.append((names.index(sine.of), sine))
-        return Timeline(_Sines(offset, tuple(found)), not found)
+def _sine(of: str, amplitude: float, frequency: float, phase: float = 0.0) -> tuple[str, float, float, float]:
+    """A wave, amplitude sin(2 pi frequency t + phase), added to the component ``of``."""
+    return of, finite("amplitude", amplitude), positive("frequency", frequency, "Hz"), finite("phase", phase)
 
 
-@dataclass(frozen=True)
-class Waypoints:
-    """A reference of waypoints: straight lines, or a monotone cubic, between them."""
-
-    times: Any
-    values: Any
-    between: str = "lines"
-
-    def timeline(self, where: Where, names: Sequence[str], what: str, _: tuple[float, float]) -> Timeline:
-        """The rows at their times."""
-        times = where.at("times").check(lambda name, given: require_finite(name, as_floats(name, given)), self.times)
-        if times.ndim != 1 or len(times) < 2 or not (np.diff(times) > 0.0).all():
-            raise where.at("times").error(f"must be two or more, and increase [s], got {self.times}")
-        if not isinstance(self.values, list) or len(self.values) != len(times):
-            raise where.at("values").error(f"must be {len(times)} rows, one for each of times")
-        rows = np.array([where.at("values", k).numbers(row, names, what) for k, row in enumerate(self.values)])
-        if where.at("between").one_of(self.between, ("lines", "smooth")) == "lines":
-            return Timeline(_Rows(times, rows))
-        try:
-            with np.errstate(all="ignore"):
-                return Timeline(_Rows(times, rows, scipy.interpolate.PchipInterpolator(times, rows)))
-        except ValueError as error:
-            raise where.at("values").error(f"no smooth curve goes through them: {error}") from None
+def _sines(reader: Reader, sines: Any = None, offset: Any = 0.0) -> Timeline:
+    """Sines about an offset."""
+    where, names, found = reader.where, list(reader.names), []
+    values = where.at("offset").numbers(offset, names, reader.what)
+    for place, table in where.tables({} if sines is None else {"sines": sines}, "sines"):
+        of, amplitude, frequency, phase = place.call(_sine, table)
+        place.at("of").one_of(of, names)
+        if frequency > 0.5 / reader.dt:
+            most = f"<= {0.5 / reader.dt:g} [Hz], the most that dt = {reader.dt:g} s resolves"
+            raise place.at("frequency").error(f"must be {most}, got {frequency:g}")
+        found.append((names.index(of), amplitude, frequency, phase))
+    return Timeline(partial(_waves, values, found), not found)
 
 
-@dataclass(frozen=True)
-class Samples:
-    """A reference in a CSV or npz file."""
-
-    file: Any
-
-    def timeline(self, where: Where, names: Sequence[str], what: str, horizon: tuple[float, float]) -> Timeline:
-        """The columns of the components over the column t."""
-        place = where.at("file")
-        path = place.file(self.file)
-        try:
-            columns = _npz(path) if path.suffix == ".npz" else _csv(path)
-            for name in ("t", *names):
-                if name not in columns:
-                    owner = "times [s]" if name == "t" else f"the {what} {name!r}"
-                    raise InputError(f"it has no column {name!r} of {owner}; columns: {', '.join(columns)}")
-            t, rows = columns["t"], np.column_stack([columns[name] for name in names])
-            if len(t) < 2 or not (np.diff(t) > 0.0).all():
-                raise InputError("it must have two or more increasing times")
-            end = horizon[1]
-            if t[0] > _ROUNDING * end or t[-1] < end * (1.0 - _ROUNDING):
-                raise InputError(f"its times go from {t[0]:g} to {t[-1]:g} s, the scene lasts from 0 to {end:g} s")
-        except (InputError, FileError) as error:
-            raise place.error(f"{path.name}: {error}") from None
-        return Timeline(_Rows(t, rows))
+def _waypoints(reader: Reader, times: Any, values: Any, between: str = "lines") -> Timeline:
+    """Waypoints: straight lines, or a monotone cubic, between them."""
+    where = reader.where
+    t = where.at("times").check(lambda name, own: require_finite(name, as_floats(name, own)), times)
+    if t.ndim != 1 or len(t) < 2 or not (np.diff(t) > 0.0).all():
+        raise where.at("times").error(f"must be two or more, and increase [s], got {times}")
+    if not isinstance(values, list) or len(values) != len(t):
+        raise where.at("values").error(f"must be {len(t)} rows, one for each of times")
+    rows = np.array([where.at("values", k).numbers(row, reader.names, reader.what) for k, row in enumerate(values)])
+    if where.at("between").one_of(between, ("lines", "smooth")) == "lines":
+        return Timeline(partial(_lines, t, rows))
+    try:
+        with np.errstate(all="ignore"):
+            return Timeline(partial(_curve, t, scipy.interpolate.PchipInterpolator(t, rows)))
+    except ValueError as error:
+        raise where.at("values").error(f"no smooth curve goes through them: {error}") from None
 
 
-KINDS: tuple[Any, ...] = (Samples, Waypoints, Sines)
+def _samples(reader: Reader, file: Any) -> Timeline:
+    """The columns of the components over the column t of a CSV or npz file."""
+    place, end = reader.where.at("file"), reader.end
+    path = place.file(file)
+    try:
+        columns = _npz(path) if path.suffix == ".npz" else _csv(path)
+        for name in ("t", *reader.names):
+            if name not in columns:
+                owner = "times [s]" if name == "t" else f"the {reader.what} {name!r}"
+                raise InputError(f"it has no column {name!r} of {owner}; columns: {', '.join(columns)}")
+        t, rows = columns["t"], np.column_stack([columns[name] for name in reader.names])
+        if len(t) < 2 or not (np.diff(t) > 0.0).all():
+            raise InputError("it must have two or more increasing times")
+        if t[0] > _ROUNDING * end or t[-1] < end * (1.0 - _ROUNDING):
+            raise InputError(f"its times go from {t[0]:g} to {t[-1]:g} s, the scene lasts from 0 to {end:g} s")
+    except (InputError, FileError) as error:
+        raise place.error(f"{path.name}: {error}") from None
+    return Timeline(partial(_lines, t, rows))
 
 
-def timeline(
-    given: Any, where: Where, names: Sequence[str], what: str, robot: Robot, horizon: tuple[float, float]
-) -> Timeline:
-    """The values over time of a reference; ``what`` is one of its components, the horizon the step and the duration."""
-    for kind in KINDS:
-        if isinstance(given, Mapping) and given.keys() & {item.name for item in fields(kind)}:
-            found: Timeline = where.call(kind, given).timeline(where, names, what, horizon)
-            return found
-    if isinstance(given, str) and tuple(names) == robot.joint_names:
-        return constant(where.positions(given, robot))
-    return constant(where.numbers(given, names, what))
+def timeline(given: Any, reader: Reader, keep: Integers | slice) -> Timeline:
+    """The values over time of a reference, of the components to ``keep``."""
+    where, names = reader.where, reader.names
+    for kind in (_samples, _waypoints, _sines):
+        if isinstance(given, Mapping) and given.keys() & inspect.signature(kind).parameters.keys():
+            found: Timeline = where.call(kind, given, reader=reader)
+            break
+    else:
+        posture = isinstance(given, str) and tuple(names) == reader.robot.joint_names
+        values = where.positions(given, reader.robot) if posture else where.numbers(given, names, reader.what)
+        found = Timeline(partial(_waves, values, ()), True)
+    return replace(found, at=partial(_columns, found, keep))
 
 
 def _csv(path: Path) -> dict[str, Floats]:

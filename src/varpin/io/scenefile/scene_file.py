@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,7 +13,7 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control import OptimalControlProblem, Solution, solve
-from varpin.control.costs import CostError
+from varpin.control.costs import CostError, CostSum
 from varpin.errors import InputError
 from varpin.integrators import Integrator
 from varpin.io.scenefile import kinds
@@ -31,7 +32,7 @@ from varpin.support.checks import count, positive
 from varpin.support.markup import facts
 from varpin.trajectory import Trajectory
 
-_OPTIONS = ("tolerance", "max_iterations", "second_order", "forward", "regularization", "true_cost")
+_OPTIONS = ("tolerance", "max_iterations", "second_order", "regularization", "true_cost")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -100,20 +101,17 @@ class SceneFile:
         task = self._task
         if not task.tables.get("cost"):
             raise task.where.at("cost").error("is missing; a scene to solve needs at least one [[cost]]")
-        task.require_start()
         horizon = {key: value for key, value in task.tables["horizon"].items() if key != "duration"}
         options = horizon | {"dt": self.dt, "steps": self.steps, "integrator": self.integrator}
         options |= {"control_limits": (-task.control_limit, task.control_limit)}
         options |= {"constraints": task.plan_constraints()}
         try:
-            return OptimalControlProblem(task.scene, task.cost(), task.q0, task.v0, **options)
+            return OptimalControlProblem(task.scene, CostSum(task.costs), task.q0, task.v0, **options)
         except (CostError, InputError) as error:
-            about = error.argument if isinstance(error, InputError) else None
-            if about is None and any(key in str(error) for key in horizon):
-                raise task.where.at("horizon").of(error, horizon) from None
-            key = (about or "cost").replace("constraints[", "plan_constraint[")
-            where = task.where.at("horizon") if key in ("controls", "sampling") else task.where
-            raise where.at(key).error(str(error)) from None
+            if index := re.search(r"constraints(\[\d+\])", " ".join(getattr(error, "__notes__", ()))):
+                raise task.where.at(f"plan_constraint{index[1]}").error(str(error)) from None
+            wrong = task.where.at("horizon").of(error, horizon)
+            raise (task.where.at("cost").error(str(error)) if wrong.key == "horizon" else wrong) from None
 
     def controls(self) -> Floats | None:
         """Controls of a simulation, (N, m) or (m,), or None for none."""
@@ -193,7 +191,7 @@ class SceneFile:
             duration: Duration of the motion [s]; the horizon if left out.
         """
         constraints = self.problem if self._task.tables.get("plan_constraint") else self.scene
-        return marks_of(self._task, self.steps * self.dt if duration is None else duration, constraints)
+        return marks_of(self._task.costs, self.q0, self.steps * self.dt if duration is None else duration, constraints)
 
     def load_solution(self, path: str | Path) -> Solution:
         """Read a solution of this scene that :meth:`Solution.save` wrote; see :meth:`Solution.load`."""

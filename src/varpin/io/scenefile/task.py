@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import inspect
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from varpin.arrays import Floats, Mask
+from varpin.arrays import Floats, Integers, Mask
+from varpin.control import costs
 from varpin.control.constraints import PlanConstraint
-from varpin.control.costs import Cost, CostSum, Terminal
+from varpin.control.costs import Cost
 from varpin.errors import RobotNotFound, VarpinError
 from varpin.io.scenefile import kinds
 from varpin.io.scenefile.reading import SceneFileError, Where
-from varpin.io.scenefile.references import Timeline, constant, timeline
+from varpin.io.scenefile.references import Reader, Timeline, timeline
 from varpin.mechanics.description import description_constraints
 from varpin.mechanics.forces import Force, PositionServo
 from varpin.mechanics.noise import Noise
@@ -26,7 +29,7 @@ from varpin.model.clearance import Obstacle
 from varpin.model.inertia import Payload
 from varpin.model.tree import frame_index
 from varpin.simulation.start import on_constraints, time_steps
-from varpin.support.checks import count
+from varpin.support.checks import count, flag
 
 # Largest number of steps; with costs a tenth of it by their number, as each evaluates its reference at each step.
 _MOST_STEPS, _PER_COST = 10**7, 10
@@ -40,61 +43,14 @@ TABLES = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Term:
-    """A term of the cost."""
-
-    where: Where
-    kind: str  # its type in the file
-    options: Mapping[str, Any]  # other keys than these
-    terminal: bool  # whether it is a cost at the end instead of an integral over time
-    weight: Floats  # of its components (c,)
-    target: Timeline | None  # of its components
-    hold: Floats | None  # configuration (n,) that its reference is to hold [rad or m]
-    names: tuple[str, ...] | None  # the joints of its components; None for components that are not joints
-
-    @property
-    def frame(self) -> str:
-        """The name of its frame; empty if it has none."""
-        return str(self.options.get("frame", ""))
-
-    def limits(self, robot: Robot) -> tuple[Floats, Floats] | None:
-        """The limits (n,), (n,) of a barrier."""
-        velocity = robot.velocity_limit
-        return {"joint_limits": robot.position_limits, "velocity_limits": (-velocity, velocity)}.get(self.kind)
-
-    def make(self, scene: Scene, joints: Sequence[str], driven: Sequence[str]) -> Cost | None:
-        """The cost of a scene with these joints and these driven joints; None if it weighs nothing of it."""
-        weight, target, robot = self.weight, self.target, scene.robot
-        if self.names is not None:
-            keep = [self.names.index(name) for name in (driven if self.kind in kinds.OF_CONTROLS else joints)]
-            weight, target = weight[keep], None if target is None else target.columns(keep)
-        if self.hold is not None:
-            target = constant(closest_controls(scene, self.hold))
-        limits = self.limits(robot)
-        if not weight.any() or (limits is not None and not np.isfinite(limits).any()):
-            return None
-        own = dict(self.options)
-        own["weight"] = float(weight[0]) if self.kind == "manipulability" else weight
-        if target is not None:
-            turned = self.kind == "frame_orientation"
-            value: Any = _Turning(target) if turned else target
-            own[kinds.target_key(self.kind)] = value(0.0) if target.constant else value
-        if self.names is None or limits is not None:
-            own["robot"] = robot
-        with self.where.named({**self.options, "weight": 0.0, "target": 0.0}):
-            cost = kinds.COSTS[self.kind](**own)
-        return Terminal(cost) if self.terminal else cost
+def _turned(angles: Floats) -> Floats:
+    """The rotation matrix Rz(yaw) Ry(pitch) Rx(roll) of (roll, pitch, yaw), as in a URDF."""
+    return np.asarray(Rotation.from_euler("xyz", angles).as_matrix())
 
 
-@dataclass(frozen=True, eq=False)
-class _Turning:
-    """Rotation matrices over time, Rz(yaw) Ry(pitch) Rx(roll) as in a URDF; a class, so that it can be pickled."""
-
-    angles: Timeline
-
-    def __call__(self, time: float) -> Floats:
-        return np.asarray(Rotation.from_euler("xyz", self.angles(time)).as_matrix())
+# A part of this function can be pickled, and a closure cannot.
+def _turned_at(angles: Timeline, time: float) -> Floats:
+    return _turned(angles(time))
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,16 +59,36 @@ class Task:
 
     where: Where
     tables: Mapping[str, Any]  # the content of the file
+    robot: Robot  # whose joints the numbers in the file are of
+    motors: tuple[str, ...]  # names of its driven joints
     scene: Scene
+    joints: Integers  # the robot's coordinates that are in the scene (n,)
+    columns: Integers  # the motors that are (m,)
     q0: Floats  # (n,) [rad or m]
     v0: Floats  # (n,) [rad/s or m/s]
     dt: float  # [s]
     steps: int
-    driven: tuple[str, ...]  # names of the driven joints (m)
     gear: Floats  # generalized force per control (m,)
     torque_limit: Floats  # (m,) [N m or N], infinite where there is none
-    terms: tuple[Term, ...] = ()  # of the cost
+    costs: tuple[Cost, ...] = ()
     controls: Timeline | str | None = None  # of a simulation; "hold" for those that hold the robot at q0
+
+    @property
+    def driven(self) -> list[str]:
+        """Names of the driven joints (m)."""
+        return [self.motors[column] for column in self.columns]
+
+    def complete(self) -> Task:
+        """The task with its costs and controls."""
+        given = self.where.entries(self.tables, "cost", kinds.COSTS)
+        if given:
+            self.require_start()
+        found = [_cost(self, *each) for each in given]
+        return replace(self, costs=tuple(cost for cost in found if cost is not None), controls=_controls(self))
+
+    def reader(self, where: Where, names: Sequence[str], what: str) -> Reader:
+        """What references with these components are of."""
+        return Reader(where, self.robot, names, what, self.dt, self.dt * self.steps)
 
     def require_start(self) -> None:
         """Refuse a start off the constraints."""
@@ -124,26 +100,20 @@ class Task:
         """The same task with ``joints`` held at their initial positions, and without what acts on them alone."""
         if not joints:
             return self
-        names = self.scene.robot.joint_names
+        names = self.robot.joint_names
         held = {name: float(self.q0[names.index(name)]) for name in joints}
         keep, columns = np.flatnonzero([name not in held for name in names]), driving(self.scene, held)
-        moving = [not term.frame or joints_of_frame(self.scene.robot, term.frame)[keep].any() for term in self.terms]
-        controls = self.controls
-        return replace(
+        part = replace(
             self,
             scene=self.scene.without(held),
+            joints=keep,
+            columns=columns,
             q0=self.q0[keep],
             v0=self.v0[keep],
-            driven=tuple(self.driven[column] for column in columns),
             gear=self.gear[columns],
             torque_limit=self.torque_limit[columns],
-            terms=tuple(
-                replace(term, hold=None if term.hold is None else term.hold[keep])
-                for term, moves in zip(self.terms, moving, strict=True)
-                if moves
-            ),
-            controls=controls.columns(columns.tolist()) if isinstance(controls, Timeline) else controls,
         )
+        return part.complete()
 
     @property
     def positions(self) -> Mask:
@@ -163,32 +133,26 @@ class Task:
         """Times over the horizon [s] at which controls and references are sampled for checks."""
         return np.linspace(0.0, self.steps * self.dt, min(self.steps, _SAMPLES) + 1)
 
-    def cost(self) -> Cost:
-        """The cost as an object."""
-        made = [term.make(self.scene, self.scene.robot.joint_names, self.driven) for term in self.terms]
-        return CostSum(tuple(cost for cost in made if cost is not None))
-
     def plan_constraints(self) -> list[PlanConstraint]:
         """The constraints of a plan."""
         found, robot = [], self.scene.robot
-        for where, given in self.where.at("plan_constraint").tables(self.tables.get("plan_constraint", [])):
-            word, kind, own = where.kind(given, kinds.PLAN_CONSTRAINTS)
+        for where, word, kind, own in self.where.entries(self.tables, "plan_constraint", kinds.PLAN_CONSTRAINTS):
             others: dict[str, Any] = {} if word == "control_rate" else {"robot": robot}
             if word == "clearance":
-                bodies = where.at("obstacles").tables(own.pop("obstacles", []))
+                bodies = where.entries({"obstacles": own.pop("obstacles", [])}, "obstacles", kinds.OBSTACLES)
                 others |= {"obstacles": [_obstacle(*body) for body in bodies], "capsules": None}
-                own |= {"srdf": where.at("srdf").file(own["srdf"])} if "srdf" in own else {}
+                if "srdf" in own:
+                    own["srdf"] = where.at("srdf").file(own["srdf"])
             elif word.endswith("_limits") and own.keys() & {"lower", "upper"}:
                 others["limits"] = own.pop("lower", -np.inf), own.pop("upper", np.inf)
             elif "rotation" in own:
                 angles = where.at("rotation").numbers(own["rotation"], kinds.ANGLES, "angle")
-                own["rotation"] = Rotation.from_euler("xyz", angles).as_matrix()
+                own["rotation"] = _turned(angles)
             found.append(where.call(kind, own, **others))
         return found
 
 
-def _obstacle(where: Where, given: Any) -> Obstacle:
-    word, make, own = where.kind(given, kinds.OBSTACLES)
+def _obstacle(where: Where, word: str, make: Callable[..., Obstacle], own: dict[str, Any]) -> Obstacle:
     if word == "mesh" and "path" in own:
         own["path"] = where.at("path").file(own["path"])
     return where.call(make, own)
@@ -205,10 +169,10 @@ def joints_of_frame(robot: Robot, frame: str) -> Mask:
 
 def required_of(task: Task, *, idle: bool) -> tuple[Task, Required]:
     """The task without idle joints, unless they stay, and the report on it."""
-    scene, kept = task.scene, task.where.at("plan_constraint").tables(task.tables.get("plan_constraint", []))
+    scene, kept = task.scene, task.where.entries(task.tables, "plan_constraint", kinds.PLAN_CONSTRAINTS)
     out: Mapping[str, float] = {}
     if idle and not (kept or scene.constraints):
-        touched = np.any([np.zeros(scene.robot.dof), *(_touched(term, task) for term in task.terms)], axis=0)
+        touched = np.any([np.zeros(scene.robot.dof), *(_touched(cost, task) for cost in task.costs)], axis=0)
         busy = [name for name, acts in zip(scene.robot.joint_names, touched, strict=True) if acts]
         controls: Any = np.zeros(scene.controls) if task.controls is None else task.controls
         if isinstance(controls, Timeline):
@@ -218,8 +182,8 @@ def required_of(task: Task, *, idle: bool) -> tuple[Task, Required]:
         out = idle_joints(scene, task.q0, task.v0, controls if scene.controls else None, busy)
     part = task.without(list(out))
     told = report(part.scene, scene, out)
-    costs = [term.kind + (" at the end" if term.terminal else "") for term in part.terms]
-    words = dict.fromkeys(place.kind(given, kinds.PLAN_CONSTRAINTS)[0] for place, given in kept)
+    costs = [kinds.COST_WORDS[type(cost)] + (" at the end" if cost.at_end else "") for cost in part.costs]
+    words = dict.fromkeys(word for _, word, *_ in kept)
     terms = {
         **told.terms,
         "torque limits": joints_with(np.isfinite(part.torque_limit), part.driven),
@@ -232,24 +196,24 @@ def required_of(task: Task, *, idle: bool) -> tuple[Task, Required]:
     return part, replace(told, terms=terms)
 
 
-def _touched(term: Term, task: Task) -> Mask:
+def _touched(cost: Any, task: Task) -> Mask:
     """Joints (n,) that a term of the cost would move, or that it charges in the initial configuration."""
-    scene, robot = task.scene, task.scene.robot
-    if term.names is None:
-        return joints_of_frame(robot, term.frame) if term.frame else np.ones(robot.dof, dtype=np.bool_)
-    if (limits := term.limits(robot)) is not None:
-        rest = task.q0 if term.kind == "joint_limits" else np.zeros(robot.dof)
-        margin = term.where.at("margin").numbers(term.options.get("margin", 0.0), robot.joint_names)
-        return np.asarray((term.weight != 0.0) & ((rest > limits[1] - margin) | (rest < limits[0] + margin)))
-    rest = task.q0 if term.kind == "tracking" else np.zeros(robot.dof)
-    if term.kind in kinds.OF_CONTROLS:
+    scene, still = task.scene, np.zeros(task.scene.robot.dof)
+    if isinstance(cost, costs.CenterOfMassCost):
+        return np.ones(len(still), dtype=np.bool_)
+    if hasattr(cost, "frame"):
+        return joints_of_frame(scene.robot, cost.frame)
+    if isinstance(cost, costs.JointLimitBarrier | costs.VelocityLimitBarrier):
+        rest = task.q0 if isinstance(cost, costs.JointLimitBarrier) else still
+        beyond = (rest > cost.limits[1] - cost.margin) | (rest < cost.limits[0] + cost.margin)
+        return np.asarray((cost.weight != 0.0) & beyond)
+    rest = task.q0 if isinstance(cost, costs.TrackingCost) else still
+    if cost.of_controls:
         rest = scene.command_at(task.q0)
-    wanted = rest[None] if term.target is None else term.target.at(task.times)
-    if term.hold is not None:
-        wanted = closest_controls(scene, term.hold)[None]
-    moves = ((wanted != rest) & (term.weight != 0.0)).any(axis=0)
-    of_controls = term.kind in kinds.OF_CONTROLS
-    return np.asarray((scene.actuation != 0.0)[:, moves].any(axis=1) if of_controls else moves)
+    wanted: Any = cost.before if isinstance(cost, costs.ControlRateCost) else cost.reference
+    wanted = rest if wanted is None else wanted.at(task.times) if isinstance(wanted, Timeline) else wanted
+    moves = ((np.atleast_2d(wanted) != rest) & (cost.weight != 0.0)).any(axis=0)
+    return np.asarray((scene.actuation != 0.0)[:, moves].any(axis=1) if cost.of_controls else moves)
 
 
 def task_of(root: Where, tables: dict[str, Any]) -> Task:
@@ -257,23 +221,22 @@ def task_of(root: Where, tables: dict[str, Any]) -> Task:
     root.table(tables, TABLES, ("robot", "horizon"))
     at = root.at("horizon")
     keys = ("dt", "steps", "duration", "hold", "sampling", "controls", "between_nodes")
-    horizon = at.table(tables["horizon"], keys, ("dt",))
-    costs = len(root.at("cost").tables(tables.get("cost", [])))
-    if ("steps" in horizon) == ("duration" in horizon):
-        raise at.error("a horizon has steps, or a duration [s]: give one of them")
+    horizon = at.table(tables["horizon"], keys)
+    costs = len(root.tables(tables, "cost"))
     with at.named(horizon):
-        dt, steps = time_steps(horizon["dt"], horizon.get("steps"), horizon.get("duration"))
+        dt, steps = time_steps(horizon.get("dt"), horizon.get("steps"), horizon.get("duration"))
         count("steps", steps, 1)
     if steps * max(1, _PER_COST * costs) > _MOST_STEPS:
         raise at.error(f"{steps} steps are more than {_MOST_STEPS}, or a tenth of that divided by the number of costs")
-    return _on_robot(root, tables, _robot(root.at("robot"), tables["robot"]), dt, steps)
+    return _on_robot(root, tables, _robot(root, tables), dt, steps)
 
 
-def _robot(where: Where, given: Any) -> Robot:
+def _robot(root: Where, tables: Mapping[str, Any]) -> Robot:
     """The robot of a file, or several in one."""
-    if not isinstance(given, list):
-        return _one(where, given)
-    members = [(place, dict(place.table(own))) for place, own in where.tables(given)]
+    where = root.at("robot")
+    if not isinstance(tables["robot"], list):
+        return _one(where, tables["robot"])
+    members = [(place, dict(place.table(own))) for place, own in root.tables(tables, "robot")]
     prefixes = [place.at("prefix").text(own.pop("prefix")) if "prefix" in own else "" for place, own in members]
     robots = [_one(place, own) for place, own in members]
     with where.named():
@@ -293,8 +256,7 @@ def _one(where: Where, given: Any) -> Robot:
     folders = own.get("package_dirs", [])
     if isinstance(folders, list) and folders:
         own["package_dirs"] = [where.at("package_dirs", k).beside(folder) for k, folder in enumerate(folders)]
-    payloads = where.at("payload").tables(own.get("payload", []))
-    own["payload"] = [place.call(Payload, load) for place, load in payloads]
+    own["payload"] = [place.call(Payload, load) for place, load in where.tables(own, "payload")]
     lock = own.get("lock", {})
     for joint, value in lock.items() if isinstance(lock, dict) else ():
         if isinstance(value, int | float):
@@ -312,7 +274,7 @@ def _placement(where: Where, given: dict[str, Any]) -> Floats:
     where.table(given, ("xyz", "rpy"))
     transform = np.eye(4)
     angles = where.at("rpy").numbers(given.get("rpy", 0.0), kinds.ANGLES, "angle")
-    transform[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
+    transform[:3, :3] = _turned(angles)
     transform[:3, 3] = where.at("xyz").numbers(given.get("xyz", 0.0), ("x", "y", "z"), "axis")
     return transform
 
@@ -326,19 +288,17 @@ def _on_robot(root: Where, tables: Mapping[str, Any], robot: Robot, dt: float, s
     driven, gear, limit = _actuation(root.at("actuation"), tables.get("actuation", {}), robot)
     matrix = np.zeros((robot.dof, len(driven)))
     matrix[[robot.coordinate(joint) for joint in driven], np.arange(len(driven))] = gear
-    constraints: list[Any] = []
-    for where, given in root.at("constraint").tables(tables.get("constraint", [])):
-        _, kind, own = where.kind(given, kinds.CONSTRAINTS)
-        constraints.append(_bound(where, kind, own, robot))
+    own = root.entries(tables, "constraint", kinds.CONSTRAINTS)
+    constraints = [_bound(where, kind, keys, robot) for where, _, kind, keys in own]
     given = {
         "gravity": tables.get("gravity", True),
         "damping": tables.get("damping"),
         "friction": tables.get("friction"),
         "stiffness": springs.get("stiffness", 0.0),
         "rest": root.at("springs", "rest").positions(springs.get("rest", 0.0), robot),
-        "forces": _forces(root.at("force"), tables.get("force", []), robot, driven, limit),
+        "forces": _forces(root, tables, robot, driven, limit),
         "actuation": matrix,
-        "noise": _noise(root.at("noise"), tables.get("noise", []), robot, driven) or None,
+        "noise": _noise(root, tables, robot, driven) or None,
         "constraints": constraints or None,
     }
     try:
@@ -348,20 +308,25 @@ def _on_robot(root: Where, tables: Mapping[str, Any], robot: Robot, dt: float, s
         key = next((key for word, key in words.items() if word in str(error)), root.of(error, given).key)
         raise SceneFileError(root.path.name, key, str(error)) from None
     v0 = root.at("initial", "v").numbers(initial.get("v", 0.0), names)
-    task = Task(root, tables, scene, q0, v0, dt, steps, driven, gear, limit)
-    horizon = dt, dt * steps
-    terms = [_term(where, cost, task, horizon) for where, cost in root.at("cost").tables(tables.get("cost", []))]
-    where = root.at("simulate")
-    controls = where.table(tables.get("simulate", {}), ("controls", "seed")).get("controls")
-    if controls is not None and controls != "hold":
-        controls = timeline(controls, where.at("controls"), driven, "driven joint", robot, horizon)
-        force = np.abs(controls.at(task.times) * gear).max(axis=0)
-        over = (force > limit * (1.0 + _ROUNDING)) & ~task.positions
-        if over.any():
-            k = int(np.argmax(over))
-            told = f"of {driven[k]!r} reach {force[k]:g} N m or N; torque_limit is {limit[k]:g}"
-            raise where.at("controls").error(told)
-    return replace(task, terms=tuple(terms), controls=controls)
+    every = np.arange(robot.dof), np.arange(len(driven))
+    return Task(root, tables, robot, driven, scene, *every, q0, v0, dt, steps, gear, limit).complete()
+
+
+def _controls(task: Task) -> Timeline | str | None:
+    """The controls of a simulation, within the torque limits."""
+    where = task.where.at("simulate")
+    given = where.table(task.tables.get("simulate", {}), ("controls", "seed")).get("controls")
+    if given is None or given == "hold":
+        return given
+    where = where.at("controls")
+    found = timeline(given, task.reader(where, task.motors, "driven joint"), task.columns)
+    force = np.abs(found.at(task.times) * task.gear).max(axis=0)
+    over = (force > task.torque_limit * (1.0 + _ROUNDING)) & ~task.positions
+    if over.any():
+        k = int(np.argmax(over))
+        limit = task.torque_limit[k]
+        raise where.error(f"of {task.driven[k]!r} reach {force[k]:g} N m or N; torque_limit is {limit:g}")
+    return found
 
 
 def _actuation(where: Where, given: Any, robot: Robot) -> tuple[tuple[str, ...], Floats, Floats]:
@@ -399,13 +364,12 @@ def _bound(where: Where, kind: Any, own: dict[str, Any], robot: Robot) -> Any:
     return made
 
 
-def _forces(where: Where, given: Any, robot: Robot, driven: Sequence[str], limit: Floats) -> list[Force]:
+def _forces(root: Where, tables: Mapping[str, Any], robot: Robot, driven: Sequence[str], limit: Floats) -> list[Force]:
     """The forces of a file. Torque limits of driven joints bound the effort of servos."""
     most = np.full(robot.dof, np.inf)
     most[[robot.coordinate(joint) for joint in driven]] = limit
     found: list[Force] = []
-    for place, table in where.tables(given):
-        word, kind, own = place.kind(table, kinds.FORCES)
+    for place, word, kind, own in root.entries(tables, "force", kinds.FORCES):
         if word == "friction" and own.get("level") == "robot":
             own["level"] = robot.friction
         force = _bound(place, kind, own, robot)
@@ -418,11 +382,10 @@ def _forces(where: Where, given: Any, robot: Robot, driven: Sequence[str], limit
     return found
 
 
-def _noise(where: Where, given: Any, robot: Robot, driven: Sequence[str]) -> list[Noise]:
+def _noise(root: Where, tables: Mapping[str, Any], robot: Robot, driven: Sequence[str]) -> list[Noise]:
     """The noise models of a file."""
     found: list[Noise] = []
-    for place, table in where.tables(given):
-        word, kind, own = place.kind(table, kinds.NOISE)
+    for place, word, kind, own in root.entries(tables, "noise", kinds.NOISE):
         whose, what = (driven, "driven joint") if word == "control" else (robot.joint_names, "joint")
         if "intensity" in own:
             own["intensity"] = place.at("intensity").numbers(own["intensity"], whose, what)
@@ -432,36 +395,55 @@ def _noise(where: Where, given: Any, robot: Robot, driven: Sequence[str]) -> lis
     return found
 
 
-def _term(where: Where, table: Any, task: Task, horizon: tuple[float, float]) -> Term:
-    """A term of the cost; ``horizon`` is the step and the duration [s]."""
-    kind, _, own = where.kind(table, kinds.COSTS)
-    robot, target_key = task.scene.robot, kinds.target_key(kind)
-    keys = kinds.cost_keys(kind)
+def _cost(task: Task, where: Where, kind: str, make: type[Cost], own: dict[str, Any]) -> Cost | None:
+    """A term of the cost; None if it weighs nothing of the task's joints."""
+    scene, robot, keys = task.scene, task.robot, kinds.cost_keys(kind)
     where.table(own, keys, [key for key, needed in keys.items() if needed])
-    names: tuple[str, ...] | None = None
-    if kind in kinds.OF_JOINTS + kinds.OF_CONTROLS:
-        names = task.driven if kind in kinds.OF_CONTROLS else robot.joint_names
-    what = "joint" if names is not None else "component"
-    if "frame" in own:
-        where.at("frame").one_of(own["frame"], [frame.name for frame in robot.model.frames])
-    axes = names if names is not None else kinds.AXES.get(kind, ("weight",))
-    weight = where.at("weight").numbers(own.pop("weight", 1.0), axes, what)
-    hold, terminal, given = own.pop("hold", None), own.pop("terminal", False), own.pop(target_key, None)
-    if not isinstance(terminal, bool):
-        raise where.at("terminal").error("must be true or false")
+    names, what = kinds.AXES.get(kind, ("weight",)), "component"
+    keep: Any = slice(None)
+    if kind in kinds.OF_CONTROLS:
+        names, keep, what = task.motors, task.columns, "joint"
+    elif kind in kinds.OF_JOINTS:
+        names, keep, what = robot.joint_names, task.joints, "joint"
+    weight = where.at("weight").numbers(own.pop("weight", 1.0), names, what)[keep]
+    terminal = where.at("terminal").check(flag, own.pop("terminal", False))
+    if kind.endswith("_limits"):
+        limits = scene.robot.position_limits if kind == "joint_limits" else scene.robot.velocity_limit
+        if not np.isfinite(limits).any():
+            if len(task.joints) < robot.dof:
+                return None
+            raise where.at("type").error(f"robot {robot.name!r} has no such limits")
+        if "margin" in own:
+            own["margin"] = where.at("margin").numbers(own["margin"], names)[keep]
+    own |= _target(task, where, kind, own, names, what, keep)
+    if not weight.any():
+        return None
+    own["weight"] = float(weight[0]) if kind == "manipulability" else weight
+    others = {"robot": scene.robot} if "robot" in inspect.signature(make).parameters else {}
+    with where.named(own):
+        cost = make(**own, **others)
+    return costs.Terminal(cost) if terminal else cost
+
+
+def _target(
+    task: Task, where: Where, kind: str, own: dict[str, Any], names: Sequence[str], what: str, keep: Any
+) -> dict[str, Any]:
+    """The target of a term by its key, from the keys of its table, which lose it; of the components to ``keep``."""
+    key, robot = kinds.target_key(kind), task.scene.robot
+    hold, given, at = own.pop("hold", None), own.pop(key, None), where.at(key)
     if hold is not None and given is not None:
-        raise where.error(f"hold and {target_key} exclude each other: give one of them")
-    at, target = where.at(target_key), None
-    if kind == "control_rate" and given is not None:
-        target = constant(at.numbers(given, axes, what))
-    elif target_key and hold is None and kind != "control_rate":
-        axes = kinds.ANGLES if kind == "frame_orientation" else axes
-        target = timeline(0.0 if given is None else given, at, axes, what, robot, horizon)
-        if kind == "tracking" and target.constant:
-            at.refuse_degrees(target(0.0), robot.joint_names, robot.slides.tolist())
+        raise where.error(f"hold and {key} exclude each other: give one of them")
     if hold is not None:
-        hold = task.q0 if hold is True else where.at("hold").positions(hold, robot)
-    term = Term(where, kind, own, terminal, weight, target, hold, names)
-    if (limits := term.limits(robot)) is not None and not np.isfinite(limits).any():
-        raise where.at("type").error(f"robot {robot.name!r} has no such limits")
-    return term
+        q = task.q0 if hold is True else where.at("hold").positions(hold, task.robot)[task.joints]
+        return {key: closest_controls(task.scene, q)}
+    if kind == "control_rate":
+        return {key: None if given is None else at.numbers(given, names, what)[keep]}
+    if not key:
+        return {}
+    turned = kind == "frame_orientation"
+    reader = task.reader(at, kinds.ANGLES if turned else names, what)
+    target = timeline(0.0 if given is None else given, reader, keep)
+    if kind == "tracking" and target.constant:
+        at.refuse_degrees(target(0.0), robot.joint_names, robot.slides.tolist())
+    value: Any = partial(_turned_at, target) if turned else target
+    return {key: value(0.0) if target.constant else value}
