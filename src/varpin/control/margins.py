@@ -13,7 +13,7 @@ from varpin.arrays import Floats
 from varpin.control.between_nodes import NOWHERE, Instants
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import Status
-from varpin.control.monte_carlo import Paths, found_by, joined, with_margins
+from varpin.control.monte_carlo import PolicyPaths, with_margins
 from varpin.control.multipliers import at_nodes, split
 from varpin.control.noise import deviations
 from varpin.control.problem import OptimalControlProblem
@@ -23,8 +23,6 @@ from varpin.control.solution import Solution
 from varpin.control.stages import Feedback, Steps
 from varpin.errors import VarpinError
 from varpin.finding import Finding
-from varpin.mechanics.wiener import children
-from varpin.support.executors import executing
 
 # How often margins are widened by counting motions; from 2 to 5.
 _COUNTS = 3
@@ -61,9 +59,10 @@ def _counted(plan: Solution, seed: tuple[int, ...]) -> list[_Counted]:
     problem, motion = plan.problem, plan.trajectory
     bounds, paths = with_margins(problem), _MOTIONS // 4 if problem.scene.noise.diffusion is None else _MOTIONS
     keep = max(_ENOUGH, *(math.ceil(paths * ndtr(-bound.source.margin)) for bound in bounds))
-    every = Paths.of(problem, plan.policy, children(np.random.default_rng(seed), paths), paths, keep)
-    with executing(None, None) as pool:
-        found = joined(list(found_by(every, pool)), keep)
+    every = PolicyPaths(problem, plan.policy, paths, np.random.default_rng(seed), keep=keep)
+    with every.executing(None, None) as pool:
+        every.simulate(pool)
+    found = every.found()
     finished = int(np.isfinite(found.costs).sum())
     if 2 * finished < paths:
         raise VarpinError(f"{paths - finished} of {paths} motions under noise fail")

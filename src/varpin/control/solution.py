@@ -16,19 +16,19 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.control.between_nodes import enforced
 from varpin.control.history import Iteration, Refinement, SearchState, Status
-from varpin.control.monte_carlo import MonteCarlo, monte_carlo
+from varpin.control.monte_carlo import MonteCarlo, MonteCarloInterrupted, PolicyPaths
 from varpin.control.multipliers import ConstraintReport, Multipliers, reports
 from varpin.control.noise import left_within_steps
 from varpin.control.problem import OptimalControlProblem, require_problem
 from varpin.control.stages import Feedback, Steps
 from varpin.control.verification import Verification, verify
-from varpin.errors import FileError, InputError
-from varpin.finding import Finding
+from varpin.errors import FileError, InputError, VarpinError
+from varpin.finding import Finding, announce
 from varpin.io.archive import Axes, members_of, read_npz, record_of, write_npz
 from varpin.linearization import velocity_at_nodes
 from varpin.model import Robot
 from varpin.signals.policy import LinearPolicy
-from varpin.support.checks import JointValues, count, flag, path_like, positive, word
+from varpin.support.checks import JointValues, count, flag, path_like, positive, told_motion, word
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, folded, listed, table, warning_count
 from varpin.trajectory import Trajectory
@@ -312,7 +312,7 @@ class Solution(Frozen):
 
         Path i draws its noise from the i-th child of ``rng``, so results are the same bytes for any number of workers,
         threads, processes or machines of one kind. Workers return only costs. Noise that only Python evaluates
-        (:class:`varpin.CustomNoise`) is simulated path by path, which is slow, and serially without ``executor``.
+        (:class:`varpin.CustomNoise`) is simulated path by path, which is slow.
 
         Main args:
             paths: Number of paths.
@@ -320,30 +320,28 @@ class Solution(Frozen):
             feedback: False for the controls alone.
 
         Other Args:
-            workers: Number of threads; by default one per core.
+            workers: Number of threads; by default one per core, and one under a ``CustomNoise``.
             executor: Any ``concurrent.futures.Executor`` instead of threads; see :func:`varpin.simulate_ensemble`.
             progress: Called after each chunk of paths with (paths done, paths in all).
 
         Raises:
             InputError: Wrong arguments.
-            VarpinError: Fewer than two paths succeeded, or workers were lost repeatedly.
+            ForceError, ConstraintError, NoiseError: A user's function failed in a path, which the error names.
+            VarpinError: Fewer than two paths succeeded, or workers were lost.
             MonteCarloInterrupted: Ctrl-C; holds the result of the paths done. It is a KeyboardInterrupt.
         """
         policy, gains = self.policy, Feedback(self.gains, self.previous_gains)
         if not flag("feedback", feedback):
             policy, gains = policy.without_feedback(), Feedback(np.zeros(self.gains.shape), None)
-        steps, known = Steps(self.problem, self.trajectory), np.isfinite(self.noise_cost)
-        return monte_carlo(
-            self.problem,
-            policy,
-            self.expected_cost,
-            paths,
-            rng,
-            within=left_within_steps(steps, gains) if known else 0.0,
-            workers=workers,
-            executor=executor,
-            progress=progress,
-        )
+        paths, known = count("paths", paths, least=2), np.isfinite(self.noise_cost)
+        told_motion("progress", progress, "paths done, paths in all")
+        within = left_within_steps(Steps(self.problem, self.trajectory), gains) if known else 0.0
+        every = PolicyPaths(self.problem, policy, paths, rng, predicted=self.expected_cost, within=within)
+        found = every.result(every.run(executor, workers, progress, MonteCarloInterrupted))
+        if found is None:
+            raise VarpinError(f"fewer than two of {paths} paths got to the end; a smaller dt may help")
+        announce(logger, self.problem.scene.announced, self.problem.dt, found.warnings)
+        return found
 
 
 def solution_trajectory(path: str | os.PathLike[str], robot: Robot | None = None) -> Trajectory:

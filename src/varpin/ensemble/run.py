@@ -5,15 +5,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import closing, suppress
 
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.ensemble.paths import Shared, simulate_paths, without_geometry
+from varpin.ensemble.paths import Shared, without_geometry
 from varpin.ensemble.record import Ensemble, EnsembleInterrupted
-from varpin.ensemble.statistics import Sums, findings_of_paths
-from varpin.errors import InputError, VarpinError, WorkersLost
+from varpin.ensemble.statistics import Sums
+from varpin.errors import InputError, VarpinError
 from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene, require_scene
@@ -33,7 +32,6 @@ from varpin.support.checks import (
     require_memory,
     told_motion,
 )
-from varpin.support.executors import executing, in_order, take_all
 
 logger = logging.getLogger(__name__)
 
@@ -65,7 +63,7 @@ def simulate_ensemble(
     is therefore the same, byte for byte, for any number of threads, processes or machines of one kind.
 
     Main args:
-        scene: The scene, with noise that the core can evaluate (not a ``CustomNoise``).
+        scene: The scene. Noise that only Python evaluates (:class:`varpin.CustomNoise`) is slow.
         q0: Initial configuration, (n,) or by joint name for all paths, or (P, n) [rad or m].
         v0: Initial velocity, the same [rad/s or m/s].
         dt: Time step [s].
@@ -84,7 +82,7 @@ def simulate_ensemble(
         quantiles: Levels in [0, 1]; with an empty list, workers return moments alone. Quantiles are of all paths if
             these are stored, or if P (N + 1) 2n is at most 33 million; otherwise of as many of the first paths,
             ``statistics.quantile_paths``.
-        workers: Number of threads; the number of cores if left out.
+        workers: Number of threads; if left out the number of cores, and one under a ``CustomNoise``.
         executor: Any ``concurrent.futures.Executor`` instead of threads: a ``ProcessPoolExecutor``, Dask's
             ``client.get_executor()``, an ``mpi4py.futures.MPIPoolExecutor``. It stays open. At most
             256 chunks of paths are submitted and not yet merged; together they return at most 2 GiB, unless two chunks
@@ -92,9 +90,10 @@ def simulate_ensemble(
         progress: Called with (paths done, P) after each chunk.
 
     Raises:
-        InputError: Wrong shapes, values that are not finite, or a scene whose noise the core cannot evaluate.
-        ForceError: A function of a :class:`varpin.CustomForce` failed. The error names the path and holds its motion up
-            to the failure.
+        InputError: Wrong shapes, or values that are not finite.
+        ForceError, ConstraintError, NoiseError: A function of a :class:`varpin.CustomForce`,
+            :class:`varpin.CustomConstraint` or :class:`varpin.CustomNoise` failed. The error names the path and holds
+            its motion up to the failure.
         AssemblyError: No configuration near q0 satisfies the scene's constraints.
         VarpinError: Every path failed.
         WorkersLost: The executor has lost its workers; holds the finished paths.
@@ -106,8 +105,6 @@ def simulate_ensemble(
     told_motion("progress", progress, "paths done, paths in all")
     _require_memory(scene, steps, paths, store=store)
     start = [_per_path(name, value, paths, scene.robot.joint_names) for name, value in (("q0", q0), ("v0", v0))]
-    if scene.noise.diffusion is None:
-        raise InputError("an ensemble needs noise that the core evaluates; a CustomNoise is simulated path by path")
     levels = require_finite("quantiles", as_floats("quantiles", quantiles))
     if levels.ndim != 1 or ((levels < 0.0) | (levels > 1.0)).any():
         raise InputError(f"quantiles must be levels in [0, 1], got {quantiles}")
@@ -123,31 +120,14 @@ def simulate_ensemble(
         some = np.linspace(0, paths - 1, 1 if noisy else min(1 + paths // _OF, _CHOOSING)).astype(np.int64)
         integrator = stronger(usual_integrator(scene, start[0][j], start[1][j], dt, noisy=noisy) for j in some)
     commands = commands_of(scene, integrator, controls, steps, dt)
-    with executing(executor, workers) as pool:
-        shared = Shared(without_geometry(scene), integrator, commands, dt, steps, children(rng, paths))
-        sums = Sums(shared, paths, levels, store=store)
-        try:
-            tasks = sums.tasks(start[0], start[1])
-            with closing(in_order(pool, simulate_paths, tasks, result_bytes=sums.part_bytes())) as parts:
-                take_all(parts, sums.add, lambda: progress(sums.done, paths) if progress is not None else None)
-            assert sums.done == paths
-            found = findings_of_paths(shared, start[0], start[1], sums.extremes, pool)
-        except (KeyboardInterrupt, WorkersLost) as stop:
-            kept = None
-            if sums.done:
-                seen: tuple[Finding, ...] = ()
-                # The workers may have stopped; a second Ctrl-C leaves the examination out.
-                with suppress(KeyboardInterrupt):
-                    seen = findings_of_paths(shared, start[0][: sums.done], start[1][: sums.done], sums.extremes, None)
-                kept = sums.ensemble((*sums.lost(), *seen))
-            if isinstance(stop, WorkersLost):
-                raise WorkersLost(stop.__cause__, kept) from stop.__cause__
-            raise EnsembleInterrupted(kept) from None
+    shared = Shared(without_geometry(scene), integrator, commands, dt, steps, children(rng, paths))
+    sums = Sums(shared, start[0], start[1], levels, store=store)
+    found = sums.run(executor, workers, progress, EnsembleInterrupted)
     if len(sums.failures) == paths:
         raise VarpinError(sums.failing())
-    found = (*in_other_units(scene, start[0][0], start[1][0]), *moved, *_alike(scene, start), *sums.lost(), *found)
+    found = (*in_other_units(scene, start[0][0], start[1][0]), *moved, *_alike(scene, start), *found)
     announce(logger, scene.announced, dt, found)
-    return sums.ensemble(found)
+    return sums.result(found)
 
 
 def _onto_constraints(scene: Scene, start: Sequence[Floats]) -> tuple[list[Floats], tuple[Finding, ...]]:

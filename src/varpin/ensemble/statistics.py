@@ -1,20 +1,21 @@
-"""Chunks of paths merged into the statistics of an ensemble, in the order of the paths."""
+"""Chunks of paths merged into the statistics of an ensemble."""
 
 from __future__ import annotations
 
+import functools
 import os
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import closing
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.arrays import Floats
-from varpin.ensemble.paths import Extremes, Moments, Part, Shared, Task, chunks, examine
-from varpin.ensemble.record import Ensemble, EnsembleStatistics, PathFailure
+from varpin.arrays import Floats, Integers
+from varpin.ensemble.paths import Part, Paths, Reduction, Shared
+from varpin.ensemble.record import Ensemble, EnsembleStatistics
 from varpin.finding import Finding
-from varpin.support.executors import in_order
+from varpin.support.frozen import Frozen
 
 # Without stored paths, quantiles are those of as many of the first paths as have this many numbers, P (N + 1) 2n.
 _KEPT = 2**25
@@ -22,90 +23,88 @@ _KEPT = 2**25
 _SPAN = 100_000
 
 
-def greater(one: Extremes, other: Extremes) -> Extremes:
-    """The greater of each extreme; ``one`` where both are equal."""
-    return {name: max(one.get(name, found), found, key=lambda x: x[0]) for name, found in other.items()}
+@dataclass(frozen=True, eq=False)
+class Moments(Frozen):
+    """Sums over some paths at each of N + 1 nodes."""
+
+    count: Integers  # (N + 1,)
+    mean: Floats  # of x and of the energy (N + 1, 2n + 1)
+    squares: Floats  # sums of products of the deviations of x from its mean (N + 1, 2n, 2n)
+    energy: Floats  # sums of squared deviations of the energy from its mean (N + 1,)
+
+    # Paths that blow up may have squares that are infinite.
+    @classmethod
+    @np.errstate(over="ignore", invalid="ignore")
+    def of(cls, x: Floats, nodes: Integers) -> Moments:
+        """Sums of x and the energy (N + 1, 2n + 1, C), the first ``nodes`` (C,) of each path; x is overwritten."""
+        gone = np.arange(len(x))[:, None] >= nodes
+        count = len(nodes) - gone.sum(axis=1)
+        np.copyto(x, 0.0, where=gone[:, None])
+        mean = x.sum(axis=2) / np.maximum(count, 1)[:, None]
+        x -= mean[:, :, None]
+        np.copyto(x, 0.0, where=gone[:, None])
+        squares = np.einsum("jaP,jbP->jab", x[:, :-1], x[:, :-1])
+        return cls(count, mean, squares, np.einsum("jP,jP->j", x[:, -1], x[:, -1]))
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def merged(self, other: Moments) -> Moments:
+        """Sums over the paths of both (Chan, Golub and LeVeque 1979)."""
+        total = self.count + other.count
+        share = other.count / np.maximum(total, 1)
+        apart = other.mean - self.mean
+        weight, x = self.count * share, apart[:, :-1]
+        return Moments(
+            total,
+            self.mean + apart * share[:, None],
+            self.squares + other.squares + (weight[:, None] * x)[:, :, None] * x[:, None, :],
+            self.energy + other.energy + weight * apart[:, -1] ** 2,
+        )
 
 
-def findings_of_paths(
-    shared: Shared, q0: Floats, v0: Floats, extremes: Extremes, pool: Executor | None
-) -> tuple[Finding, ...]:
-    """Findings about a few paths, each kind once, for the path with the largest value; without a pool in this thread.
-
-    They are the first path, and those with the most split steps, the most energy and the largest speed.
-    """
-    if not shared.steps:
-        return ()
-    split = [path for amount, path in (extremes["split"],) if amount > 0]
-    some = dict.fromkeys([0, *split, extremes["energy"][1], extremes["speed"][1]])
-    tasks = [Task(shared, path, q0[path : path + 1].copy(), v0[path : path + 1].copy()) for path in some]
-    found: dict[str, Finding] = {}
-    results = (examine(task) for task in tasks) if pool is None else in_order(pool, examine, tasks)
-    with closing(results) as results:
-        for path, findings in zip(some, results, strict=True):
-            for finding in findings:
-                kept = found.get(finding.kind)
-                if kept is None or (finding.value or 0.0) > (kept.value or 0.0):
-                    found[finding.kind] = finding.about(f"path {path}: ")
-    return tuple(found.values())
+def moments_of(
+    arrays: dict[str, Floats], nodes: Integers, *, second: str, kept: tuple[str, ...]
+) -> tuple[Moments, Integers, dict[str, Floats]]:
+    """The moments of a chunk's paths, their numbers of nodes, and the arrays that are kept."""
+    whole = np.concatenate([arrays["q"], arrays[second], arrays["energy"][:, :, None]], axis=2)
+    # Statistics run over the paths, which are the last axis.
+    x = np.ascontiguousarray(whole.transpose(1, 2, 0))
+    return Moments.of(x, nodes), nodes, {name: arrays[name] for name in kept}
 
 
-class Sums:
+class Sums(Paths):
     """Sums over the chunks, which are added in the order of the paths."""
 
-    def __init__(self, shared: Shared, paths: int, levels: Floats, *, store: bool) -> None:
-        self.shared, self.paths, self.levels, self.store = shared, paths, levels, store
-        n, N = shared.scene.robot.dof, shared.steps
-        self.done = 0
+    def __init__(self, shared: Shared, q0: Floats, v0: Floats, levels: Floats, *, store: bool) -> None:
+        super().__init__(shared, q0, v0)
+        self.levels, self.store, paths = levels, store, len(q0)
         self.moments: Moments | None = None
-        self.failures: list[PathFailure] = []
-        self.extremes: Extremes = {}
         # Paths whose arrays are kept, for the record or for quantiles.
-        self.known = paths if store else min(paths, max(1, _KEPT // ((N + 1) * 2 * n))) if len(levels) else 0
+        width = 2 * (shared.steps + 1) * shared.scene.robot.dof
+        self.known = paths if store else min(paths, max(1, _KEPT // width)) if len(levels) else 0
         self.nodes = np.zeros(self.known, dtype=np.int64)
         names = ("q", "v", "p", "energy", "u") if store else ("q", shared.second)
         self.stored = {name: np.empty((self.known, *shared.shape(name))) for name in names}
 
-    def tasks(self, q0: Floats, v0: Floats) -> Iterator[Task]:
-        """The chunks."""
-        for first, last in chunks(self.shared.steps, self.paths):
-            kept = tuple(self.stored) if first < self.known else ()
-            yield Task(self.shared, first, q0[first:last].copy(), v0[first:last].copy(), kept)
+    def reduction(self, first: int) -> tuple[tuple[str, ...], Reduction]:
+        kept = tuple(self.stored) if first < self.known else ()
+        return kept, functools.partial(moments_of, second=self.shared.second, kept=kept)
 
     def part_bytes(self) -> int:
         """Size of a chunk's result [bytes], the arrays alone."""
-        _, paths = next(chunks(self.shared.steps, self.paths))
+        _, paths = next(self.shared.chunks(len(self.q0)))
         size = 2 * self.shared.scene.robot.dof
         row = sum(array[:1].nbytes for array in self.stored.values()) if self.known else 0
         return 8 * (self.shared.steps + 1) * (size**2 + size + 3) + paths * (8 + row)
 
-    def add(self, part: Part) -> None:
-        """Add the next chunk. One after a gap, which Ctrl-C may leave, is not added."""
-        if part.first != self.done:
-            return
-        assert part.moments is not None
-        self.moments = part.moments if self.moments is None else self.moments.merged(part.moments)
-        self.failures += part.failures
-        self.extremes = greater(self.extremes, part.extremes)
-        self.done += len(part.nodes)
-        room = self.nodes[part.first : self.done]
-        room[:] = part.nodes[: len(room)]
-        for name, array in part.stored.items():
-            self.stored[name][part.first : self.done] = array[: len(room)]
+    def take(self, part: Part) -> None:
+        moments, nodes, stored = part.found
+        self.moments = moments if self.moments is None else self.moments.merged(moments)
+        room = slice(part.first, min(part.first + part.paths, self.known))
+        self.nodes[room] = nodes[: self.nodes[room].size]
+        for name, array in stored.items():
+            self.stored[name][room] = array[: self.nodes[room].size]
 
-    def lost(self) -> tuple[Finding, ...]:
-        """A finding about failed paths, if there are any."""
-        if not self.failures:
-            return ()
-        return (Finding("failed paths", f"{self.failing()}; they are left out of the statistics from there on"),)
-
-    def failing(self) -> str:
-        """The number of failed paths and the earliest failure, in words."""
-        first = min(self.failures, key=lambda failure: failure.step)
-        return f"{len(self.failures)} of {self.done} paths failed, the first at step {first.step}: {first.reason}"
-
-    def ensemble(self, found: Sequence[Finding]) -> Ensemble:
-        """The record of the paths added so far, with findings as its warnings."""
+    def result(self, found: Sequence[Finding]) -> Ensemble:
         moments, n2 = self.moments, 2 * self.shared.scene.robot.dof
         assert moments is not None
         there = moments.count > 0

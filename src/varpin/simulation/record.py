@@ -204,7 +204,7 @@ def located(
     commands: Commands,
     dt: float,
     increments: Floats | None,
-    error: CustomForceError | CustomConstraintError,
+    error: InputError,
     where: str = "",
 ) -> VarpinError:
     """The error of a user's function that failed in a motion, with its step and the motion before.
