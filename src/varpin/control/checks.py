@@ -262,17 +262,17 @@ def _between(solution: Solution, again: Sequence[Played]) -> Iterator[Finding]:
     if np.isnan(away).all():
         return
     for bound, outside in zip(problem.bound_constraints, again[int(np.nanargmin(away))].outside, strict=True):
-        if bound.of_controls or bound.source.equality or outside.worst <= NOTABLE * bound.scale:
+        if bound.of_controls or bound.source.equality or outside.violation <= NOTABLE * bound.scale:
             continue
         advice = "a smaller dt or a bound narrower by that much keeps it there"
         if not (problem.linear or problem.between_nodes):
             advice = f"between_nodes=True, {advice}"
         sentence = (
-            f"{problem.label_of(bound.source)} holds at the nodes, but between nodes {outside.row} is violated by "
-            f"{outside.worst:.2g} {bound.unit} at t = {outside.time:.4g} s: {advice}"
+            f"{outside.label} holds at the nodes, but between nodes it is violated by {outside.violation:.2g} "
+            f"{bound.unit}, {outside.where}: {advice}"
         )
-        kind = "constraints between nodes"
-        yield Finding(kind, sentence, time=outside.time, value=outside.worst, unit=bound.unit)
+        time = float(outside.t[outside.excess.max(axis=1).argmax()])
+        yield Finding("constraints between nodes", sentence, time=time, value=outside.violation, unit=bound.unit)
 
 
 # Noise

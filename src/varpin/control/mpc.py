@@ -22,6 +22,7 @@ from varpin.control.rollout import first_commands
 from varpin.control.search import Search
 from varpin.control.sizes import NOTABLE, TENTH
 from varpin.control.solving import searched
+from varpin.control.verification import report_of
 from varpin.errors import ControlError, InputError, LinearizationError
 from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
@@ -475,8 +476,7 @@ class _Loop:
                 found.append(Finding("infeasible ticks", text))
             if bound.source.equality:
                 continue
-            c = bound.value(motion.q, motion.v, motion.u)
-            reports.append(ConstraintReport(label, bound.rows, bound.unit, bound.times, c, np.zeros_like(c), False))
+            reports.append(report_of(problem, bound, bound.value(motion.q, motion.v, motion.u)))
             if (worst := reports[-1].violation) > NOTABLE * bound.scale:
                 text = (
                     f"the plant's motion violates {label} by {worst:.2g} {bound.unit}, {reports[-1].where}. Use a "

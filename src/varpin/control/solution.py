@@ -24,7 +24,7 @@ from varpin.control.stages import Feedback, Steps
 from varpin.control.verification import Verification, verify
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.finding import Finding, announce
-from varpin.io.archive import Axes, members_of, read_npz, record_of, write_npz
+from varpin.io.archive import Axes, members_of, read_npz, record_of, save_npz
 from varpin.linearization import velocity_at_nodes
 from varpin.model import Robot
 from varpin.signals.policy import LinearPolicy
@@ -171,7 +171,7 @@ class Solution(Frozen):
         # The numbers of the scene are those of the motion.
         for name, value in self.problem.setting.items():
             members[name if name.startswith("scene.") else f"problem.{name}"] = value
-        return write_npz(path, _FORMAT, members)
+        return save_npz(path, _FORMAT, members)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], problem: OptimalControlProblem) -> Solution:

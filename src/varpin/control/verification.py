@@ -10,6 +10,7 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
+from varpin.control.multipliers import ConstraintReport
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.sizes import NOTABLE
 from varpin.core.arrays import Commands
@@ -36,19 +37,8 @@ class Played(NamedTuple):
     """A motion under commands in parts of a plan's steps; all NaN where it diverges."""
 
     cost: float
-    outside: list[Outside]  # by each constraint
+    outside: list[ConstraintReport]
     nodes: Floats  # configurations at the plan's nodes
-
-
-class Outside(NamedTuple):
-    """The worst violation of a constraint by a motion, in the constraint's unit."""
-
-    worst: float = np.nan
-    time: float = np.nan
-    row: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.row} at t = {self.time:.4g} s" if self.worst > 0.0 else ""
 
 
 @dataclass(frozen=True)
@@ -212,6 +202,7 @@ def verify(
     comparison.
     """
     problem, end = plan.problem, plan.trajectory.q[-1]
+    planned = reports_on(problem, plan.trajectory, problem)
     stiff = problem.dt * rate_at_rest(problem.scene, problem.q0) > STIFF
     members = (_FAST,) if stiff else (_USUAL, _FAST)
     for integrator in (_CLOSED,) if problem.scene.constraints else members:
@@ -238,22 +229,19 @@ def verify(
             substeps=parts,
             accuracy=accuracy,
             integrator=str(integrator),
-            constraints=_violations(plan, opened, closed),
+            constraints=tuple(map(_violation, problem.bound_constraints, planned, opened.outside, closed.outside)),
         )
         if found.told or not problem.scene.dissipates:
             break
     return found
 
 
-def _violations(plan: Solution, opened: Played, closed: Played) -> tuple[ViolationOnRobot, ...]:
-    problem = plan.problem
-    both = zip(_outside(problem, problem, plan.trajectory), opened.outside, closed.outside, strict=True)
-    return tuple(
-        ViolationOnRobot(
-            problem.label_of(bound.source), bound.unit, own.worst, alone.worst, fed.worst, str(fed), 10.0 * bound.scale
-        )
-        for bound, (own, alone, fed) in zip(problem.bound_constraints, both, strict=True)
-    )
+def _violation(
+    bound: BoundConstraint, planned: ConstraintReport, opened: ConstraintReport, closed: ConstraintReport
+) -> ViolationOnRobot:
+    worst = planned.violation, opened.violation, closed.violation
+    where = closed.where if closed.violation > 0.0 else ""
+    return ViolationOnRobot(planned.label, bound.unit, *worst, where=where, range=10.0 * bound.scale)
 
 
 def replays(plan: Solution, integrator: Integrator, parts: int) -> tuple[Played, Played]:
@@ -273,24 +261,35 @@ def played(
     """The motion of a problem under commands on ``fine``, the same :meth:`in_parts`."""
     motion, failure = rollout(fine.scene, integrator, fine.q0, fine.v0, commands, fine.dt)
     if failure is not None:
-        return Played(np.nan, [Outside() for _ in fine.bound_constraints], np.full((1, fine.q0.size), np.nan))
+        return Played(np.nan, reports_on(fine, None, problem), np.full((1, fine.q0.size), np.nan))
     cost = float(fine.costs(motion.q, motion.v, fine.control_rows(motion)))
-    return Played(cost, _outside(problem, fine, motion), motion.q[:: fine.steps // problem.steps])
+    return Played(cost, reports_on(fine, motion, problem), motion.q[:: fine.steps // problem.steps])
 
 
-def _outside(problem: OptimalControlProblem, fine: OptimalControlProblem, motion: Trajectory) -> list[Outside]:
-    """The worst violation of each constraint, without margins, by a motion on ``fine``."""
+def reports_on(
+    fine: OptimalControlProblem, motion: Trajectory | None, problem: OptimalControlProblem
+) -> list[ConstraintReport]:
+    """How well a motion on ``fine``, the problem :meth:`in_parts`, satisfies each constraint, without margins.
+
+    All NaN without a motion.
+    """
     found = []
     for whole, bound in zip(problem.bound_constraints, fine.bound_constraints, strict=True):
-        c = bound.value(motion.q, motion.v, fine.control_rows(motion))
-        excess = np.abs(c) if bound.source.equality else np.maximum(c, 0.0)
+        c = np.full(bound.shape, np.nan)
+        if motion is not None:
+            c = bound.value(motion.q, motion.v, fine.control_rows(motion)).copy()
         outside = at_start(problem, whole)
         if outside is not None:
             # A row that is violated at the start cannot hold before the first node.
-            excess[: fine.steps // problem.steps - 1, outside > 0.0] = 0.0
-        sample, row = np.unravel_index(int(np.argmax(excess)), excess.shape)
-        found.append(Outside(float(excess[sample, row]), float(bound.times[sample]), bound.rows[row]))
+            c[: fine.steps // problem.steps - 1, outside > 0.0] = 0.0
+        found.append(report_of(problem, bound, c))
     return found
+
+
+def report_of(problem: OptimalControlProblem, bound: BoundConstraint, c: Floats) -> ConstraintReport:
+    """The report of a constraint with values c (K, rows), without multipliers."""
+    given = problem.label_of(bound.source), bound.rows, bound.unit, bound.times
+    return ConstraintReport(*given, c, np.zeros_like(c), bound.source.equality)
 
 
 def at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats | None:

@@ -28,7 +28,7 @@ from varpin.mechanics.wiener import Children
 from varpin.signals.commands import as_moved, lines, rows, with_ends
 from varpin.simulation.check import check
 from varpin.simulation.loop import Gains, unstable_loop
-from varpin.simulation.record import Motions, located
+from varpin.simulation.record import Motions
 from varpin.support.executors import executing, in_order, take_all
 from varpin.support.frozen import Frozen
 
@@ -161,8 +161,8 @@ def _located(task: Task, paths: range, error: InputError) -> VarpinError:
     for path in paths:
         start = task.q0[path - task.first], task.v0[path - task.first]
         (drawn,) = shared.drawn(path, path + 1)
-        given = shared.scene, shared.integrator, start, shared.commands, shared.dt, drawn
-        found = located(*given, error, f"path {path}: ")
+        motions = Motions(shared.scene, shared.integrator, *start, shared.dt)
+        found = motions.located(shared.commands, drawn, error, f"path {path}: ")
         if found is not error:
             return found
     return error

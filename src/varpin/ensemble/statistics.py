@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Integers
 from varpin.ensemble.paths import Part, Paths, Reduction, Shared
@@ -19,8 +18,6 @@ from varpin.support.frozen import Frozen
 
 # Without stored paths, quantiles are those of as many of the first paths as have this many numbers, P (N + 1) 2n.
 _KEPT = 2**25
-# Quantiles are computed for runs of nodes with up to this many numbers.
-_SPAN = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,24 +126,14 @@ class Sums(Paths):
         )
 
     def _quantiles(self) -> Floats:
-        paths, size = min(self.known, self.done), 2 * self.shared.scene.robot.dof
-        found = np.full((len(self.levels), self.shared.steps + 1, size), np.nan)
-        if not len(self.levels):
-            return found
-        span, nodes = max(1, _SPAN // (paths * size)), self.nodes[:paths]
-        spans, begin = [], 0
-        # Between two nodes at which paths fail, the set of paths is the same.
-        for end in np.unique(nodes).tolist():
-            spans += [(a, min(a + span, end), nodes >= end) for a in range(begin, end, span)]
-            begin = end
+        known, states, names = min(self.known, self.done), 2 * self.shared.scene.robot.dof, ("q", self.shared.second)
 
-        def take(part: tuple[int, int, NDArray[np.bool_]]) -> None:
-            first, last, inside = part
-            x = np.concatenate([self.stored[name][:paths, first:last] for name in ("q", self.shared.second)], axis=2)
-            # The paths are the last axis: the numbers of one quantile lie next to each other.
-            x = np.ascontiguousarray(x.transpose(1, 2, 0))
-            found[:, first:last] = np.quantile(x if inside.all() else x[:, :, inside], self.levels, axis=2)
+        def of_node(node: int) -> Floats:
+            there = self.nodes[:known] > node
+            if not there.any():
+                return np.full((len(self.levels), states), np.nan)
+            x = np.concatenate([self.stored[name][:known, node][there] for name in names], axis=1)
+            return np.asarray(np.quantile(x, self.levels, axis=0))
 
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            list(pool.map(take, spans))
-        return found
+            return np.stack(list(pool.map(of_node, range(self.shared.steps + 1))), axis=1)

@@ -13,7 +13,6 @@ import io
 import os
 import reprlib
 import secrets
-import socket
 import typing
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -47,12 +46,11 @@ class Axes:
 
 
 def save_npz(path: str | os.PathLike[str], form: str, record: Any) -> Path:
-    """Write a record of the format ``form`` as compressed npz; returns its path."""
-    return write_npz(path, form, members_of(record))
+    """Write a record, or its entries, of the format ``form`` as compressed npz; returns its path.
 
-
-def write_npz(path: str | os.PathLike[str], form: str, members: Mapping[str, Any]) -> Path:
-    """Write arrays of the format ``form``; an existing file is replaced only when the new one is complete."""
+    An existing file is replaced only when the new one is complete.
+    """
+    members = record if isinstance(record, Mapping) else members_of(record)
     with atomic_file(path) as stream:
         np.savez_compressed(stream, **members, format=form)
     return Path(path)
@@ -274,18 +272,11 @@ def _entries(kind: Any, prefix: str) -> Iterator[tuple[Any, str, Any]]:
 
 @contextlib.contextmanager
 def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A binary stream whose contents replace ``path`` when the block ends without an error, and are deleted otherwise.
-
-    What processes that were killed in such a block have left in the folder is deleted, too.
-    """
+    """A binary stream whose contents replace ``path`` when the block ends, and are deleted on an error."""
     target = writable(path)
-    host = socket.gethostname()
     # Not tempfile, whose files only their owner can read.
-    draft = target.with_name(f".varpin-{host}-{os.getpid()}-{secrets.token_hex(8)}")
+    draft = target.with_name(f".varpin-{secrets.token_hex(8)}")
     try:
-        for left in target.parent.glob(f".varpin-{host}-*-*"):
-            if not _runs(left.name.split("-")[-2]):
-                left.unlink(missing_ok=True)
         with draft.open("xb") as stream:
             yield stream
         draft.replace(target)
@@ -294,14 +285,3 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         if isinstance(error, OSError) and not isinstance(error, FileError):
             raise FileError(f"cannot write {target}: {error.strerror or error}") from None
         raise
-
-
-def _runs(process: str) -> bool:
-    """Whether a process of this machine runs."""
-    try:
-        os.kill(int(process), 0)
-    except ProcessLookupError:
-        return False
-    except (ValueError, OverflowError, OSError):
-        return True
-    return True
