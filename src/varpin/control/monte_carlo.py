@@ -20,7 +20,7 @@ from varpin.finding import Finding
 from varpin.mechanics.wiener import children
 from varpin.signals.controls import commands_of
 from varpin.signals.policy import LinearPolicy
-from varpin.support.markup import facts, warning_count
+from varpin.support.markup import Printed, warning_count
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Broken:
         time: The time [s].
         count: Number of paths that violated it there.
         paths: Number of paths.
-        promised: The share of paths that the margin allows: beyond it in a normal distribution.
+        margin: The margin, in standard deviations.
     """
 
     label: str
@@ -41,7 +41,12 @@ class Broken:
     time: float
     count: int
     paths: int
-    promised: float
+    margin: float
+
+    @property
+    def promised(self) -> float:
+        """The share of paths that the margin allows: beyond it in a normal distribution."""
+        return float(ndtr(-self.margin))
 
     @property
     def share(self) -> float:
@@ -63,7 +68,7 @@ class Broken:
 
 
 @dataclass(frozen=True)
-class MonteCarlo:
+class MonteCarlo(Printed):
     """The expected cost of a policy, by simulation.
 
     Attributes:
@@ -89,32 +94,18 @@ class MonteCarlo:
         lost = f", {self.failures} failed" if self.failures else ""
         return f"{gap}, {self.paths} paths{lost}{warning_count(self.warnings)})"
 
-    def _repr_html_(self) -> str:
-        rows: list[tuple[str, object]] = [
-            ("simulated", f"{self.cost:.6e} +- {self.standard_error:.1e}"),
-            ("predicted", f"{self.predicted:.6e}"),
-            ("paths", self.paths),
-            ("ran away", self.failures),
-        ]
-        rows += [("constraint", each) for each in self.broken]
-        return facts("Expected cost", rows + [("warning", warning) for warning in self.warnings])
-
     def __str__(self) -> str:
         gap = self.cost - self.predicted
         apart = f", {gap / self.standard_error:+.1f} standard errors" if self.standard_error > 0.0 else ""
         lost = f"; {self.failures} more ran away and are not counted" if self.failures else ""
-        return "\n".join(
-            [
-                f"{'':16}{'expected cost':>14}",
-                f"{'simulated':16}{self.cost:14.6e} +- {self.standard_error:.1e} ({self.paths} paths{lost})",
-                f"{'predicted':16}{self.predicted:14.6e}",
-                f"{'difference':16}{gap:+14.6e} ({percent(excess(self.cost, self.predicted))}{apart})",
-                "how to read it: within three standard errors (+-) the two agree; beyond, noise is too strong for the "
-                "model",
-                *map(str, self.broken),
-                *(f"warning: {warning}" for warning in self.warnings),
-            ]
-        )
+        lines = [
+            "expected cost",
+            f"simulated:  {self.cost:.6e} +- {self.standard_error:.1e} ({self.paths} paths{lost})",
+            f"predicted:  {self.predicted:.6e}",
+            f"difference: {gap:+.6e} ({percent(excess(self.cost, self.predicted))}{apart})",
+            "how to read it: within three standard errors the two agree; beyond, noise is too strong for the model",
+        ]
+        return "\n".join([*lines, *map(str, self.broken), *(f"warning: {warning}" for warning in self.warnings)])
 
 
 class MonteCarloInterrupted(KeyboardInterrupt):
@@ -178,35 +169,49 @@ class PolicyPaths(Paths):
     def take(self, part: Part) -> None:
         self.parts.append(part.found)
 
-    def found(self) -> Found:
-        """What all paths so far have shown."""
-        costs, counts, largest = zip(*self.parts, strict=True)
-        return Found(
-            np.concatenate(costs),
-            tuple(np.sum(own, axis=0) for own in zip(*counts, strict=True)),
-            tuple(_largest(np.concatenate(own), self.keep) for own in zip(*largest, strict=True)),
-        )
+    @property
+    def costs(self) -> Floats:
+        """The cost of each path so far, NaN where one failed."""
+        return np.concatenate([part.costs for part in self.parts])
+
+    @property
+    def finished(self) -> int:
+        """Number of paths with a cost."""
+        return int(np.isfinite(self.costs).sum())
+
+    @property
+    def counts(self) -> list[Integers]:
+        """How many paths violate each constraint with a margin (K, rows)."""
+        return [np.sum(own, axis=0) for own in zip(*(part.counts for part in self.parts), strict=True)]
+
+    @property
+    def largest(self) -> list[Floats]:
+        """The largest values of these constraints, in no order (at most keep, K, rows)."""
+        every = zip(*(part.largest for part in self.parts), strict=True)
+        return [_largest(np.concatenate(own), self.keep) for own in every]
+
+    def broken(self) -> tuple[Broken, ...]:
+        """How often paths violated each constraint with a margin."""
+        found = []
+        for bound, counts in zip(with_margins(self.problem), self.counts, strict=True):
+            place, row = np.unravel_index(int(counts.argmax()), counts.shape)
+            label, time, most = self.problem.label_of(bound.source), float(bound.times[place]), int(counts.max())
+            found.append(Broken(label, bound.rows[row], time, most, self.finished, bound.source.margin))
+        return tuple(found)
 
     def result(self, found: tuple[Finding, ...]) -> MonteCarlo | None:
-        costs, every, _ = self.found()
-        good = costs[np.isfinite(costs)]
-        if len(good) < 2:
+        if self.finished < 2:
             return None
-        broken = []
-        for bound, counts in zip(with_margins(self.problem), every, strict=True):
-            place, row = np.unravel_index(int(counts.argmax()), counts.shape)
-            where = bound.rows[row], float(bound.times[place])
-            promised = float(ndtr(-bound.source.margin))
-            broken.append(Broken(self.problem.label_of(bound.source), *where, int(counts.max()), len(good), promised))
+        good = self.costs[np.isfinite(self.costs)]
         return MonteCarlo(
             cost=float(good.mean()) + self.within,
             # Without noise all paths are the same, and differ by rounding.
             standard_error=float(good.std(ddof=1) / np.sqrt(len(good))) if self.problem.scene.processes else 0.0,
             predicted=self.predicted,
             paths=len(good),
-            failures=len(costs) - len(good),
+            failures=self.done - len(good),
             warnings=found,
-            broken=tuple(broken),
+            broken=self.broken(),
         )
 
 

@@ -39,7 +39,7 @@ from varpin.simulation.record import Progress
 from varpin.simulation.simulate import noise_forgotten, simulate
 from varpin.support.checks import JointValues, control_values, count, positive, real, told_motion
 from varpin.support.frozen import Frozen
-from varpin.support.markup import facts, warning_count
+from varpin.support.markup import Printed, facts, warning_count
 from varpin.support.one_thread import one_thread
 from varpin.trajectory import Nodes, Trajectory
 
@@ -71,7 +71,7 @@ class Plant:
 
 
 @dataclass(frozen=True, eq=False)
-class MpcRun(Frozen):
+class MpcRun(Printed, Frozen):
     """The result of a controller's run on a plant.
 
     Attributes:
@@ -143,12 +143,6 @@ class MpcRun(Frozen):
         if self.budget < np.inf:
             text += f"; {int(self.late.sum())} later than {1e3 * self.budget:.3g} ms"
         return text + (f"; {int(self.failed.sum())} failed" if self.failed.any() else "")
-
-    def _repr_html_(self) -> str:
-        rows = [("ticks", self._summary), ("plant", self.motion)]
-        rows += [("constraint", report) for report in self.constraints]
-        rows += [("warning", sentence) for sentence in self.warnings]
-        return facts(f"Run of a controller of {self.motion.robot}", rows)
 
     def __str__(self) -> str:
         warned = (f"warning: {sentence}" for sentence in self.warnings)

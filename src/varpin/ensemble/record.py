@@ -15,7 +15,7 @@ from varpin.finding import Finding
 from varpin.io.archive import Axes, read_npz, record_of, save_npz
 from varpin.support.checks import path_like
 from varpin.support.frozen import Frozen
-from varpin.support.markup import facts, table, warning_count
+from varpin.support.markup import Printed, warning_count
 
 FORMAT = "varpin.ensemble/1"
 
@@ -67,7 +67,7 @@ class PathFailure:
 
 
 @dataclass(frozen=True, eq=False)
-class Ensemble(Frozen):
+class Ensemble(Printed, Frozen):
     """P paths over N steps.
 
     Attributes:
@@ -117,16 +117,9 @@ class Ensemble(Frozen):
         return f"Ensemble({self._size()}{warning_count(self.warnings)})"
 
     def __str__(self) -> str:
-        return "\n".join([f"Ensemble({self._size()})", *(f"warning: {warning}" for warning in self.warnings)])
-
-    def _repr_html_(self) -> str:
-        moments, half = self.statistics, self.statistics.mean.shape[1] // 2
-        deviation = np.sqrt(np.diagonal(moments.covariance[-1]))
-        rows = [(j, float(moments.mean[-1, j]), float(deviation[j])) for j in range(half)]
-        head = ("coordinate", "mean of q in the end [rad or m]", "standard deviation")
-        energy = f"{moments.energy_mean[-1]:.4g} +- {moments.energy_deviation[-1]:.2g} in the end"
-        warned = [("warning", warning) for warning in self.warnings]
-        return facts("Ensemble", [("of", self._size()), ("energy [J]", energy), *warned], table(head, rows))
+        own = self.statistics
+        energy = f"energy [J]: {own.energy_mean[-1]:.4g} +- {own.energy_deviation[-1]:.2g} in the end"
+        return "\n".join([f"Ensemble({self._size()})", energy, *(f"warning: {own}" for own in self.warnings)])
 
     def _size(self) -> str:
         counted = int(self.statistics.count[0])

@@ -28,6 +28,14 @@ def facts(title: str, rows: Iterable[tuple[str, object]], *parts: str) -> str:
     return f'<div class="varpin"><b>{_text(title)}</b><table>{body}</table>{"".join(parts)}</div>'
 
 
+class Printed:
+    """A result whose text has a name and a value in each line below the first; notebooks show it as a table."""
+
+    def _repr_html_(self) -> str:
+        title, *lines = str(self).splitlines()
+        return facts(title, (line.split(": ", 1) if ": " in line else ("", line) for line in lines))
+
+
 def table(
     columns: Sequence[str], rows: Iterable[Sequence[object]], strong: Iterable[int] = (), *, most: int = _MOST
 ) -> str:
