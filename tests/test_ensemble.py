@@ -221,7 +221,7 @@ def test_interruption_before_anything_is_done(monkeypatch):
 
 def test_quantiles_of_very_many_paths_are_those_of_the_first(monkeypatch):
     whole = run(paths=300, steps=20)
-    monkeypatch.setattr(varpin.ensemble.statistics, "_KEPT", 100 * 21 * 4)
+    monkeypatch.setattr(varpin.ensemble.run, "_KEPT", 100 * 21 * 4)
     found = run(paths=300, steps=20, store=False, workers=3).statistics
     assert (whole.statistics.quantile_paths, found.quantile_paths) == (300, 100)
     np.testing.assert_array_equal(found.quantiles, run(paths=100, steps=20).statistics.quantiles)
@@ -390,7 +390,7 @@ def test_nothing_comes_back_that_was_not_asked_for():
     paths, steps = 2000, 50
     end = run(paths=paths, steps=steps, store=False, quantiles=(), executor=shipping)
     same_ensembles(end, run(paths=paths, steps=steps, store=False, quantiles=()))
-    numbers = (steps + 1) * (1 + 5 + 16 + 1)
+    numbers = (steps + 1) * (1 + 5 + 25)
     assert shipping.sent >= 10
     assert shipping.returned < shipping.sent * (8 * numbers + 5000) + 8 * paths
     assert shipping.most < 50_000

@@ -100,8 +100,7 @@ def too_small(solution: Solution) -> list[Finding]:
         return [Finding("margins not counted", f"how often motions violate bounds with a margin= is unknown: {error}")]
     found = []
     for own in counted.broken():
-        error = math.sqrt(own.promised * (1.0 - own.promised) / own.paths)
-        if own.share <= own.promised + _DOUBT * error:
+        if own.share <= own.promised + _DOUBT * math.sqrt(own.promised * (1.0 - own.promised) / own.paths):
             continue
         sentence = (
             f"{own.label}: margin={own.margin:g} is too small for this noise, as {own.row} at t = {own.time:.4g} s is "

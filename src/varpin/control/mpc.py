@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -160,9 +161,9 @@ class Mpc:
     Controls that are linear between nodes follow the plan's first line over the tick. The next plan's line begins at a
     control of its own, which reacts to the measured state at once; a :class:`ControlRateCost` makes the jump small.
 
-    Constraints hold along every horizon to the accuracy of few iterations, which ``Solution.violation`` has; a goal
-    (:class:`ReachFrame`) applies to the end of every horizon. The size of a margin is that of the first plan. After it
-    constraints also hold in the middles of steps with ``between_nodes`` or linear controls, and else at the nodes.
+    Constraints hold along every horizon to the accuracy of few iterations, which ``Solution.violation`` has: at the
+    nodes, and in the middles of steps with ``between_nodes`` or linear controls. A goal (:class:`ReachFrame`) applies
+    to the end of every horizon. The size of a margin is that of the first plan.
 
     Main args:
         problem: The problem. Its horizon, discretization, noise, limits and constraints apply to every tick, its
@@ -295,11 +296,11 @@ class Mpc:
         scene, start, dt = plant.scene, (self.problem.q0, self.problem.v0), self.period / plant.substeps
         noisy = drawn is not None and scene.processes > 0
         method = plant.integrator or usual_integrator(scene, *start, dt, noisy=noisy)
-        given: dict[str, Any] = {"dt": dt, "steps": ticks * plant.substeps, "integrator": method}
-        given |= {"rng": drawn} if noisy else {"increments": 0.0}
+        noise: dict[str, Any] = {"rng": drawn} if noisy else {"increments": 0.0}
         try:
             # The run is checked, and its findings logged, at the end.
-            motion = simulate(scene, *start, controls=loop, check=False, **given)
+            steps = ticks * plant.substeps
+            motion = simulate(scene, *start, dt=dt, steps=steps, controls=loop, integrator=method, check=False, **noise)
         except ControlError as error:
             cause = error.__cause__
             if isinstance(cause, CostError):
@@ -322,13 +323,14 @@ class Mpc:
         announce(logger, scene.announced, dt, found)
         again = {(finding.kind, finding.joint) for finding in found}
         first = (finding for finding in loop.ticks[0].plan.warnings if (finding.kind, finding.joint) not in again)
+        plans, _, seconds, iterations, late, failures = zip(*loop.ticks, strict=True)
         return MpcRun(
             motion,
-            tuple(tick.plan for tick in loop.ticks),
-            np.array([tick.seconds for tick in loop.ticks]),
-            np.array([tick.iterations for tick in loop.ticks], dtype=np.int64),
-            np.array([tick.late for tick in loop.ticks]),
-            np.array([bool(tick.failure) for tick in loop.ticks]),
+            plans,
+            np.array(seconds),
+            np.array(iterations, dtype=np.int64),
+            np.array(late),
+            np.array(failures) != "",
             self.period,
             self.budget,
             constraints=constraints,
@@ -422,9 +424,9 @@ class _Loop:
         rows = (tick.plan.policy.feedback[min(tick.age, _lines(tick.plan) - 1)] for tick in self.ticks)
         return Gains(np.array(list(rows)), self.problem.integrator.variational)
 
-    def without_plans(self) -> list[Finding]:
+    def without_plans(self) -> Iterator[Finding]:
         """Warnings if more than a few plans took longer than the budget or the period, or searches found no plan."""
-        ticks, period, found = self.ticks[1:], self.controller.period, []
+        ticks, period = self.ticks[1:], self.controller.period
         seconds, limit = np.array([tick.seconds for tick in ticks]), min(period, self.controller.budget)
         slow, failed = int((seconds > limit).sum()), [tick.failure for tick in ticks if tick.failure]
         if slow > _FEW * len(ticks):
@@ -433,22 +435,21 @@ class _Loop:
                 f"({1e3 * seconds.mean():.3g} ms in the mean). Use fewer steps, fewer iterations, a larger budget or a "
                 "longer period (hold=)"
             )
-            found.append(Finding("late plans", text))
+            yield Finding("late plans", text)
         if failed:
             first = [bool(tick.failure) for tick in self.ticks].index(True) * period
             text = (
                 f"in {len(failed)} of {len(ticks)} ticks no plan was found and an older one acted, at t = {first:.4g} "
                 f"s for the first time: {failed[0]}"
             )
-            found.append(Finding("failed ticks", text))
+            yield Finding("failed ticks", text)
         ended = [tick.age >= _lines(tick.plan) for tick in self.ticks]
         if any(ended):
             text = (
                 f"no plan came for a whole horizon, and from t = {ended.index(True) * period:.4g} s on the last "
                 "control was held: use a longer horizon, a larger budget, or more iterations a tick"
             )
-            found.append(Finding("plan at its end", text))
-        return found
+            yield Finding("plan at its end", text)
 
     def constraints(self, motion: Trajectory) -> tuple[tuple[ConstraintReport, ...], list[Finding]]:
         """How well the plant's motion satisfied each constraint, and warnings about it and about plans."""

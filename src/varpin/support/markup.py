@@ -33,7 +33,8 @@ class Printed:
 
     def _repr_html_(self) -> str:
         title, *lines = str(self).splitlines()
-        return facts(title, (line.split(": ", 1) if ": " in line else ("", line) for line in lines))
+        pairs = (line.partition(": ") for line in lines)
+        return facts(title, [(name, value) if value else ("", name) for name, _, value in pairs])
 
 
 def table(
