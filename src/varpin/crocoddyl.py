@@ -12,8 +12,7 @@ Needs crocoddyl, which is built against one version of Pinocchio: ``pip install 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -165,16 +164,9 @@ def first_guess(problem: OptimalControlProblem) -> tuple[list[Floats], list[Floa
 
 def policy_of(problem: OptimalControlProblem, solver: Any) -> LinearPolicy:
     """The policy us - K (x - xs), within the control limits, of a solver of ``shooting_problem(problem)``."""
-    gains: Sequence[Floats] = solver.K
-    return LinearPolicy(
-        np.array(solver.us.tolist()),
-        -np.array(gains.tolist() if hasattr(gains, "tolist") else gains),
-        np.array(solver.xs.tolist())[:-1],
-        on="momentum" if problem.integrator.variational else "velocity",
-        limits=(problem.control_limits[0], problem.control_limits[1]),
-        period=problem.period,
-        joints=problem.scene.control_joints,
-    )
+    gains = -np.array(list(solver.K))
+    on: Literal["momentum", "velocity"] = "momentum" if problem.integrator.variational else "velocity"
+    return problem.policy_of(np.array(solver.us.tolist()), gains, np.array(solver.xs.tolist())[:-1], on)
 
 
 def _configuration_and_velocity(problem: OptimalControlProblem, x: Floats) -> tuple[Floats, Floats]:

@@ -270,15 +270,6 @@ class Trajectory(Frozen):
         _sealed(self.statistics)
         _sealed(self)
 
-    @classmethod
-    def assembled(cls, **values: Any) -> Trajectory:
-        """A trajectory of all its attributes, with arrays that are known to fit each other; they become read-only."""
-        made = object.__new__(cls)
-        # The frozen dataclass refuses assignments.
-        vars(made).update(values)
-        _sealed(made.statistics)
-        return _sealed(made)
-
     @property
     def steps(self) -> int:
         """N."""

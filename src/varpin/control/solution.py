@@ -190,6 +190,7 @@ class Solution(Frozen):
         if difference := problem.differs(setting):
             raise FileError(f"{source} is of another problem: {difference}")
         sizes = {"decisions": problem.decisions, "controls": scene.controls, "states": 2 * scene.robot.dof}
+        sizes["node_rows"] = sum(item.size for item in problem.bound_constraints)
         plan = record_of(cls, members, source, sizes=sizes, known={"problem": problem, "trajectory": motion})
         if other := problem.mismatch(setting, motion, plan.cost):
             raise FileError(f"{source} is {other}")
@@ -356,13 +357,9 @@ def solution_trajectory(path: str | os.PathLike[str], robot: Robot | None = None
 
 def _require_rows(source: Path, multipliers: Multipliers, problem: OptimalControlProblem) -> None:
     """Refuse multipliers of another number of rows, or of instants that the problem does not have."""
-    between = multipliers.between
-    last = len(problem.constraints), problem.steps
-    if not ((between.rows >= 0) & (between.rows < last)).all():
+    between, found = multipliers.between, multipliers.values.size
+    if not ((between.rows >= 0) & (between.rows < (len(problem.constraints), problem.steps))).all():
         raise FileError(f"{source}: multipliers.between.rows are not in the problem's steps")
-    every = sum(item.size for item in enforced(problem, between).bound_constraints)
-    at_nodes = sum(item.size for item in problem.bound_constraints)
-    for name, expected in (("values", every), ("backoff", every), ("added", at_nodes)):
-        found = getattr(multipliers, name)
-        if found is not None and found.size != expected:
-            raise FileError(f"{source}: multipliers.{name} has shape ({found.size},), where ({expected},) belongs")
+    expected = sum(item.size for item in enforced(problem, between).bound_constraints)
+    if found != expected:
+        raise FileError(f"{source}: multipliers.values has shape ({found},), where ({expected},) belongs")

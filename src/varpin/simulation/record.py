@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from varpin._version import __version__
 from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import ControlError, InputError, StepError, VarpinError
@@ -172,7 +171,7 @@ def trajectory_of(
         mean, stages, nodes = lines(on, steps.u, integrator.stage_times)
         # A kinematic input's control is where its joint is at the end of the step.
         u, within = with_ends(scene, mean, nodes[1:]), with_ends(scene, stages, nodes[1:])
-    return Trajectory.assembled(
+    return Trajectory(
         t=np.arange(N + 1, dtype=np.float64) * dt,
         q=np.concatenate([first.q, steps.q]),
         v=np.concatenate([first.v, steps.v]),
@@ -191,9 +190,6 @@ def trajectory_of(
         constraint_labels=scene.constraint_labels,
         u_stages=np.zeros((N, 0, scene.controls)) if within is None else within,
         u_nodes=nodes,
-        version=__version__,
-        warnings=(),
-        accuracy=None,
     )
 
 
