@@ -55,7 +55,6 @@ class StepModel(crocoddyl.ActionModelAbstract):
     def __init__(self, problem: OptimalControlProblem) -> None:
         super().__init__(crocoddyl.StateVector(2 * problem.scene.robot.dof), problem.scene.controls, 0)
         self._problem = problem
-        self._known: tuple[Floats, Floats, Trajectory] | None = None
         if problem.limited:
             self.u_lb, self.u_ub = np.clip(problem.control_limits, -_NO_LIMIT, _NO_LIMIT)
 
@@ -82,11 +81,9 @@ class StepModel(crocoddyl.ActionModelAbstract):
         data.Lxx, data.Lxu, data.Luu = hessian[at, at], hessian[at, by], hessian[by, by]
 
     def _step(self, x: Floats, u: Floats | None) -> Trajectory | None:
-        """The step from x under u. The last one is cached, as crocoddyl needs its derivatives next."""
+        """The step from x under u."""
         problem = self._problem
         u = np.zeros(problem.scene.controls) if u is None else u
-        if self._known is not None and np.array_equal(self._known[0], x) and np.array_equal(self._known[1], u):
-            return self._known[2]
         q, v = _configuration_and_velocity(problem, x)
         if not (np.isfinite(q).all() and np.isfinite(v).all() and np.isfinite(u).all()):
             return None
@@ -94,7 +91,6 @@ class StepModel(crocoddyl.ActionModelAbstract):
         if failure is not None:
             logger.warning("a step cannot be solved: %s", failure.reason)
             return None
-        self._known = x.copy(), u.copy(), motion
         return motion
 
 
