@@ -116,8 +116,8 @@ def test_policy_on_velocities_and_back():
         M = pin.crba(model, data, q)
         return (np.triu(M) + np.triu(M, 1).T) @ v
 
-    policy = plan.policy_on("velocity", substeps=5)
-    assert policy.hold == 25
+    policy = plan.policy_on("velocity")
+    assert policy.hold_at(plan.problem.dt / 5) == 25
     for r in (0, 2, 5):
         q, v = plan.trajectory.q[5 * r], plan.trajectory.v[5 * r]
         np.testing.assert_array_equal(policy.reference[r], np.concatenate([q, v]))

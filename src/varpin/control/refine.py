@@ -50,13 +50,18 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
             plan = plan or record.search(problem, start)
             compares = record.add(plan, began) and time_left() > 0.0
             ended = record.ended(plan.reason) if time_left() > 0.0 else f"the time limit came {doing}"
+            if ended and not compares:
+                return record.result(record.best, record.chosen, ended)
             doing = f"with half of dt = {problem.dt:g} s"
-            half, fails = _halved(problem)
-            if compares and half is None:
-                return record.result(plan, len(record.tried) - 1, "")
-            if half is None or (ended and not compares):
-                return record.result(record.best, record.chosen, ended or fails)
-            problem, start = half, half.simulate(plan.policy_on(substeps=2))
+            try:
+                # Held controls keep their period.
+                hold = problem.hold if problem.hold == 1 else 2 * problem.hold
+                problem = problem.at(dt=0.5 * problem.dt, steps=2 * problem.steps, hold=hold)
+            except VarpinError:
+                if compares:
+                    return record.result(plan, len(record.tried) - 1, "")
+                raise
+            start = problem.simulate(plan.policy)
             finer = record.search(problem, start) if compares else None
             if finer is not None and record.compare(finer, began):
                 return record.result(plan, len(record.tried) - 1, "")
@@ -73,15 +78,6 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
             reason = f"interrupted {doing}"
             best = replace(record.best, status=Status.INTERRUPTED, reason=reason)
             return record.result(best, record.chosen, reason)
-
-
-def _halved(problem: OptimalControlProblem) -> tuple[OptimalControlProblem | None, str]:
-    """The problem with half the step, held controls with their period; or why there is none."""
-    hold = problem.hold if problem.hold == 1 else 2 * problem.hold
-    try:
-        return problem.at(dt=0.5 * problem.dt, steps=2 * problem.steps, hold=hold), ""
-    except VarpinError as error:
-        return None, f"with half of dt = {problem.dt:g} s there is no plan: {error}"
 
 
 class _Record:

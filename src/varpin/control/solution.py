@@ -240,10 +240,8 @@ class Solution(Frozen):
         given = u, policy.gains[rows], reference, policy.on
         return self.problem.policy_of(*given, before=before, previous_gains=previous_gains, previous=previous)
 
-    def policy_on(self, x: Literal["momentum", "velocity"] | None = None, substeps: int = 1) -> LinearPolicy:
-        """The policy on (q, p) or on (q, v), by default the integrator's, over ``substeps`` times as many steps.
-
-        A simulation needs no ``substeps``: it derives them from its dt and the policy's period.
+    def policy_on(self, x: Literal["momentum", "velocity"] | None = None) -> LinearPolicy:
+        """The policy on (q, p) or on (q, v), by default the integrator's.
 
         Where x is not that of the problem's integrator, dp = L_vq dq + M dv converts the gains, to first order.
 
@@ -253,7 +251,6 @@ class Solution(Frozen):
         own: Literal["momentum", "velocity"] = "momentum" if self.problem.integrator.variational else "velocity"
         x = own if x is None else x
         word("x", x, ("momentum", "velocity"))
-        parts = count("substeps", substeps, least=1)
         gains, trajectory, hold = self.gains, self.trajectory, self.problem.hold
         rows, n = slice(0, -1, hold), self.problem.scene.robot.dof
         linear, previous_gains = self.problem.linear, self.previous_gains
@@ -272,8 +269,7 @@ class Solution(Frozen):
                 gains = np.concatenate([gains[:, :, :n] + second @ by_q, second @ by_p], axis=2)
         reference = np.hstack([trajectory.q[rows], (trajectory.p if x == "momentum" else trajectory.v)[rows]])
         u, before = (self.controls[1:], self.controls[0]) if linear else (self.controls, self.problem.before)
-        given = u, gains, reference, x
-        return self.problem.policy_of(*given, before=before, previous_gains=previous_gains, substeps=parts)
+        return self.problem.policy_of(u, gains, reference, x, before=before, previous_gains=previous_gains)
 
     def verify(
         self, *, tolerance: float = 1e-10, max_substeps: int = 1024, progress: Callable[[int, int], None] | None = None

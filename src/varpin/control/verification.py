@@ -294,7 +294,7 @@ def in_parts(plan: Solution, integrator: Integrator, parts: int) -> tuple[Comman
     """Commands in parts of a plan's steps: its controls alone, and with feedback."""
     problem, variational, times = plan.problem, integrator.variational, integrator.stage_times
     alone = open_line(plan.controls, times) if problem.linear else open_loop(plan.controls)
-    m, n = problem.scene.controls, problem.scene.robot.dof
-    fed = plan.policy_on("momentum" if variational else "velocity", parts)
-    closed = fed.commands(problem.steps * parts, m, n, variational=variational, stage_times=times)
+    size = problem.steps * parts, problem.scene.controls, problem.scene.robot.dof
+    fed = plan.policy_on("momentum" if variational else "velocity")
+    closed = fed.commands(*size, variational=variational, dt=problem.dt / parts, stage_times=times)
     return alone._replace(hold=problem.hold * parts), closed
