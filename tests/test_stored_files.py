@@ -85,7 +85,8 @@ def test_what_is_no_such_record(name, tmp_path):
     for share in (0.0, 0.3, 0.9, 0.99):
         path.write_bytes(whole[: int(share * len(whole))])
         unread(name, path, "truncated")
-    others = [(DATA / other).read_bytes() for other in LOADERS if other != name]
+    # Of the file of a plan the motion can be read alone.
+    others = [(DATA / other).read_bytes() for other in LOADERS if other not in (name, "solution.npz")]
     for content in (b"hello", b"\x93NUMPY", bytes(1000), pickle.dumps({"q": 1}), *others):
         path.write_bytes(content)
         unread(name, path)

@@ -27,6 +27,8 @@ from varpin.support.markup import facts, table, warning_count
 Bytes = NDArray[np.uint8]
 
 FORMAT = "varpin.trajectory/2"
+# Of the files of plans, which have a motion, too.
+PLAN_FORMAT = "varpin.solution/5"
 
 T = TypeVar("T")
 
@@ -350,7 +352,7 @@ class Trajectory(Frozen):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], robot: Robot | None = None) -> Trajectory:
-        """Read a trajectory that :meth:`save` wrote.
+        """Read a trajectory that :meth:`save` wrote, or that of a plan that :meth:`Solution.save` wrote.
 
         Args:
             path: The npz file.
@@ -364,7 +366,7 @@ class Trajectory(Frozen):
         source = path_like("path", path)
         if robot is not None:
             require_robot(robot)
-        return cls.of_members(source, read_npz(source, FORMAT), robot)
+        return cls.of_members(source, read_npz(source, FORMAT, PLAN_FORMAT), robot)
 
     @classmethod
     def of_members(cls, source: Path, members: Mapping[str, Any], robot: Robot | None) -> Trajectory:

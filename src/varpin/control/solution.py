@@ -26,16 +26,13 @@ from varpin.errors import FileError, InputError, VarpinError
 from varpin.finding import Finding, announce
 from varpin.io.archive import Axes, members_of, read_npz, record_of, save_npz
 from varpin.linearization import velocity_at_nodes
-from varpin.model import Robot
 from varpin.signals.policy import LinearPolicy
 from varpin.support.checks import JointValues, count, flag, path_like, positive, told_motion, word
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, folded, listed, table, warning_count
-from varpin.trajectory import Trajectory
+from varpin.trajectory import PLAN_FORMAT, Trajectory
 
 logger = logging.getLogger(__name__)
-
-_FORMAT = "varpin.solution/5"
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +168,7 @@ class Solution(Frozen):
         # The numbers of the scene are those of the motion.
         for name, value in self.problem.setting.items():
             members[name if name.startswith("scene.") else f"problem.{name}"] = value
-        return save_npz(path, _FORMAT, members)
+        return save_npz(path, PLAN_FORMAT, members)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], problem: OptimalControlProblem) -> Solution:
@@ -182,7 +179,7 @@ class Solution(Frozen):
                 that do not fit together or are not finite, or is of another problem.
         """
         source = path_like("path", path)
-        members, scene = read_npz(source, _FORMAT), require_problem(problem).scene
+        members, scene = read_npz(source, PLAN_FORMAT), require_problem(problem).scene
         # First the motion, whose masses give a clearer message for another robot.
         motion = replace(Trajectory.of_members(source, members, scene.robot), scene_values=scene.values)
         known = [name for name in members if name.startswith(("problem.", "scene."))]
@@ -339,16 +336,6 @@ class Solution(Frozen):
             raise VarpinError(f"fewer than two of {paths} paths got to the end; a smaller dt may help")
         announce(logger, self.problem.scene.announced, self.problem.dt, found.warnings)
         return found
-
-
-def solution_trajectory(path: str | os.PathLike[str], robot: Robot | None = None) -> Trajectory:
-    """Read only the motion of a solution, without its problem.
-
-    Raises:
-        FileError: As :meth:`Trajectory.load`.
-    """
-    source = path_like("path", path)
-    return Trajectory.of_members(source, read_npz(source, _FORMAT), robot)
 
 
 def _require_rows(source: Path, multipliers: Multipliers, problem: OptimalControlProblem) -> None:

@@ -80,8 +80,8 @@ class Entry:
         return array if dtype is None else array.astype(dtype)
 
 
-def read_npz(source: Path, form: str | None = None) -> dict[str, Entry]:
-    """The headers of the arrays of an npz file, which must be of the format ``form`` if that is given.
+def read_npz(source: Path, *forms: str) -> dict[str, Entry]:
+    """The headers of the arrays of an npz file, which must be of one of the formats ``forms`` if there are any.
 
     Each array is read where it is asked for, so that a wrong shape is found before its data.
     """
@@ -89,15 +89,10 @@ def read_npz(source: Path, form: str | None = None) -> dict[str, Entry]:
         names = [name.removesuffix(".npy") for name in archive.namelist()]
         members = {name: Entry(source, archive, name) for name in names}
     found = str(np.asarray(members.get("format", "")))
-    if form is not None and found != form:
+    if forms and found not in forms:
         what = f"its format is {reprlib.repr(found)}" if found else "it has no format"
-        raise FileError(f"{source} is another kind of file: {what} instead of {form!r}")
+        raise FileError(f"{source} is another kind of file: {what} instead of {' or '.join(map(repr, forms))}")
     return members
-
-
-def read_format(source: Path) -> str:
-    """The format of an npz file; empty if it has none."""
-    return str(np.asarray(read_npz(source).get("format", "")))
 
 
 @contextlib.contextmanager
