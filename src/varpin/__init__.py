@@ -109,7 +109,6 @@ if TYPE_CHECKING:
     from varpin.control import Solution as Solution
     from varpin.control import Status as Status
     from varpin.control import Verification as Verification
-    from varpin.control import ViolationOnRobot as ViolationOnRobot
     from varpin.control import solve as solve
     from varpin.control.constraints import KeepClear as KeepClear
     from varpin.control.constraints import KeepInBox as KeepInBox
@@ -192,7 +191,7 @@ _LATE = {
     "varpin.control": (
         "ConstraintReport Iteration MonteCarlo MonteCarloInterrupted Multipliers "
         "OptimalControlProblem Refined Refinement SearchState Solution Status "
-        "Verification ViolationOnRobot solve"
+        "Verification solve"
     ),
     "varpin.control.constraints": (
         "KeepClear KeepInBox KeepInHalfSpace KeepInSphere KeepOutOfSphere "

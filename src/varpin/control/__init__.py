@@ -13,4 +13,3 @@ from varpin.control.problem import OptimalControlProblem as OptimalControlProble
 from varpin.control.solution import Solution as Solution
 from varpin.control.solving import solve as solve
 from varpin.control.verification import Verification as Verification
-from varpin.control.verification import ViolationOnRobot as ViolationOnRobot

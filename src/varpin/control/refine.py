@@ -14,7 +14,7 @@ from varpin.control.history import Refined, Refinement, Status, part
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.sizes import FEASIBLE, SLIGHT, TENTH
 from varpin.control.solution import Solution
-from varpin.control.verification import Verification, excess, verify
+from varpin.control.verification import excess, verify
 from varpin.errors import VarpinError
 from varpin.trajectory import Trajectory
 
@@ -108,6 +108,10 @@ class _Record:
         # Constraints are looked at where parts end.
         first = PARTS if problem.constraints else 2
         found = verify(plan, tolerance=TENTH * self.wish, substeps=first, max_substeps=_FINEST)
+        shares = [
+            own.violation / (10.0 * bound.scale)
+            for own, bound in zip(found.constraints, problem.bound_constraints, strict=True)
+        ]
         row = Refined(
             dt=problem.dt,
             steps=problem.steps,
@@ -118,7 +122,7 @@ class _Record:
             iterations=plan.iterations,
             status=plan.status,
             seconds=time.perf_counter() - began,
-            violation=float(np.max([own.share for own in found.constraints], initial=0.0)),
+            violation=float(np.max(shares, initial=0.0)),
         )
         self.tried.append(row)
         kind, value = 0, row.true_cost
@@ -131,7 +135,11 @@ class _Record:
         rank = kind, value if np.isfinite(value) else np.inf
         if rank < self.rank:
             self.best, self.rank, self.chosen = plan, rank, len(self.tried) - 1
-            self.beyond = _beyond(found) if kind >= 2 else ""
+            self.beyond = ""
+            if kind >= 2 and row.violation > 0.0:
+                worst = found.constraints[int(np.argmax(shares))]
+                size = f"{worst.violation:.2g} {worst.unit} ({worst.where})"
+                self.beyond = f"violates {worst.label} on the continuous system by {size}"
         return kind == 0
 
     def compare(self, finer: Solution, began: float) -> bool:
@@ -177,11 +185,3 @@ class _Record:
             reason += f"the plan of dt = {row.dt:g} s {lost} and {above}"
         logger.log(logging.WARNING if ended else logging.INFO, "%s: %s", plan.problem.scene.robot.name, reason)
         return replace(plan, refinement=Refinement(self.wish, not ended, tuple(self.tried), chosen, reason))
-
-
-def _beyond(found: Verification) -> str:
-    """The constraint that is violated most, by how much and where, in words; empty where all hold."""
-    worst = max(found.constraints, key=lambda own: own.share, default=None)
-    if worst is None or not worst.where:
-        return ""
-    return f"violates {worst.label} on the continuous system by {worst.closed_loop:.2g} {worst.unit} ({worst.where})"

@@ -42,40 +42,6 @@ class Played(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ViolationOnRobot:
-    """Largest violation of a constraint, in its own unit.
-
-    Attributes:
-        label: The constraint.
-        unit: Unit of the values.
-        planned: In the plan, at the constraint's places.
-        open_loop: On the continuous system under the plan's controls alone, also between nodes; for a goal, at the end.
-            NaN where the motion diverges.
-        closed_loop: The same with feedback.
-        where: The worst row and time with feedback, in words; empty without violation or where the motion diverges.
-        range: The range of the constraint's values, in the same unit; 1 m or rad for frames and clearance.
-    """
-
-    label: str
-    unit: str
-    planned: float
-    open_loop: float
-    closed_loop: float
-    where: str
-    range: float = 1.0
-
-    @property
-    def share(self) -> float:
-        """The violation with feedback, relative to the range."""
-        return self.closed_loop / self.range
-
-    def __str__(self) -> str:
-        ways = [("planned", self.planned), ("controls alone", self.open_loop), ("with feedback", self.closed_loop)]
-        violations = ", ".join(f"{name} {x:.1e}" if np.isfinite(x) else f"{name} runs away" for name, x in ways)
-        return f"{self.label} is violated by [{self.unit}]: {violations}{f' ({self.where})' if self.where else ''}"
-
-
-@dataclass(frozen=True)
 class Verification(Printed):
     """Comparison of a plan with an accurate integration of the continuous system.
 
@@ -93,8 +59,10 @@ class Verification(Printed):
             allowed no doubling.
         integrator: The accurate integrator: ``Radau(stages=3)`` where dampers, friction or servos are much faster than
             the plan's step.
-        constraints: Violations of the problem's constraints on the continuous system, without margins, at the nodes of
-            the accurate integration from the plan's first one on. Rate limits of controls apply to decisions.
+        constraints: How well the continuous motion with feedback satisfies each of the problem's constraints, without
+            margins, at the nodes of the accurate integration from the plan's first one on; a goal at the end, and rate
+            limits of controls at decisions. All NaN where the motion diverges.
+        open_loop_constraints: The same under the plan's controls alone.
     """
 
     planned_cost: float
@@ -105,7 +73,8 @@ class Verification(Printed):
     substeps: int
     accuracy: float
     integrator: str = str(_USUAL)
-    constraints: tuple[ViolationOnRobot, ...] = ()
+    constraints: tuple[ConstraintReport, ...] = ()
+    open_loop_constraints: tuple[ConstraintReport, ...] = ()
 
     @property
     def violation(self) -> float:
@@ -113,7 +82,7 @@ class Verification(Printed):
 
         NaN where that motion diverges.
         """
-        return float(np.max([item.closed_loop for item in self.constraints], initial=0.0))
+        return float(np.max([own.violation for own in self.constraints], initial=0.0))
 
     @property
     def told(self) -> bool:
@@ -158,8 +127,13 @@ class Verification(Printed):
         good = "all motions run away" if self._diverges else "how good the costs are is not known"
         if np.isfinite(self.accuracy):
             good = f"costs are good to {self.accuracy:.0e} of themselves"
-        how = f"{good} ({self.substeps} substeps a step, {self.integrator})"
-        return "\n".join([*lines, how, self.reading, *map(str, self.constraints)])
+        lines += [f"{good} ({self.substeps} substeps a step, {self.integrator})", self.reading]
+        for alone, fed in zip(self.open_loop_constraints, self.constraints, strict=True):
+            ways = ("controls alone", alone.violation), ("with feedback", fed.violation)
+            worst = ", ".join(f"{name} {x:.1e}" if np.isfinite(x) else f"{name} runs away" for name, x in ways)
+            where = f" ({fed.where})" if fed.violation > 0.0 else ""
+            lines.append(f"{fed.label} is violated by [{fed.unit}]: {worst}{where}")
+        return "\n".join(lines)
 
 
 def excess(cost: float, base: float) -> float:
@@ -191,7 +165,6 @@ def verify(
     comparison.
     """
     problem, end = plan.problem, plan.trajectory.q[-1]
-    planned = reports_on(problem, plan.trajectory, problem)
     stiff = problem.dt * rate_at_rest(problem.scene, problem.q0) > STIFF
     members = (_FAST,) if stiff else (_USUAL, _FAST)
     for integrator in (_CLOSED,) if problem.scene.constraints else members:
@@ -218,19 +191,12 @@ def verify(
             substeps=parts,
             accuracy=accuracy,
             integrator=str(integrator),
-            constraints=tuple(map(_violation, problem.bound_constraints, planned, opened.outside, closed.outside)),
+            constraints=tuple(closed.outside),
+            open_loop_constraints=tuple(opened.outside),
         )
         if found.told or not problem.scene.dissipates:
             break
     return found
-
-
-def _violation(
-    bound: BoundConstraint, planned: ConstraintReport, opened: ConstraintReport, closed: ConstraintReport
-) -> ViolationOnRobot:
-    worst = planned.violation, opened.violation, closed.violation
-    where = closed.where if closed.violation > 0.0 else ""
-    return ViolationOnRobot(planned.label, bound.unit, *worst, where=where, range=10.0 * bound.scale)
 
 
 def replays(plan: Solution, integrator: Integrator, parts: int) -> tuple[Played, Played]:
