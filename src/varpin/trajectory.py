@@ -380,24 +380,21 @@ class Trajectory(Frozen):
             raise FileError(f"{source}: its times t are not dt = {found.dt} s apart")
         if not found.statistics.whole:
             raise FileError(f"{source}: statistics.substeps and statistics.halvings are not those of whole steps")
-        if robot is not None:
-            found._require_robot(source, robot)
-        return found
-
-    def _require_robot(self, source: Path, robot: Robot) -> None:
-        """Refuse a robot with other joints or masses than those of the motion in the file ``source``."""
-        if self.joint_names != robot.joint_names:
+        if robot is None:
+            return found
+        if found.joint_names != robot.joint_names:
             raise FileError(
-                f"{source} is of robot {self.robot} with joints {', '.join(self.joint_names)}; "
+                f"{source} is of robot {found.robot} with joints {', '.join(found.joint_names)}; "
                 f"{robot.name!r} has joints {', '.join(robot.joint_names)}"
             )
         masses = robot.tree.mass
-        if self.masses.shape != masses.shape or not np.allclose(self.masses, masses, rtol=1e-6):
+        if found.masses.shape != masses.shape or not np.allclose(found.masses, masses, rtol=1e-6):
             raise FileError(
-                f"{source} is of robot {self.robot}, whose links weigh {self.masses.sum():.6g} kg, and those of "
+                f"{source} is of robot {found.robot}, whose links weigh {found.masses.sum():.6g} kg, and those of "
                 f"{robot.name!r} {masses.sum():.6g} kg: load the robot with its payloads, for varpin replay by a scene "
                 "file as --robot"
             )
+        return found
 
 
 def require_trajectory(motion: object) -> Trajectory:

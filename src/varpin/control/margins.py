@@ -51,8 +51,8 @@ def _counted(plan: Solution, seed: tuple[int, ...], keep: int = 0) -> PolicyPath
     every = PolicyPaths(problem, plan.policy, paths, np.random.default_rng(seed), keep=keep)
     with every.executing(None, None) as pool:
         every.simulate(pool)
-    if 2 * every.finished < paths:
-        raise VarpinError(f"{paths - every.finished} of {paths} motions under noise fail")
+    if 2 * (finished := every.found.finished) < paths:
+        raise VarpinError(f"{paths - finished} of {paths} motions under noise fail")
     return every
 
 
@@ -70,7 +70,7 @@ def widened(plan: Solution) -> list[Floats] | None:
     if problem.scene.noise.diffusion is None or known is None:
         return None
     # The same noise in every count: what is left of a violation is then that of the plan, not of other noise.
-    counted = _counted(plan, _SEARCH, _ENOUGH)
+    counted = _counted(plan, _SEARCH, _ENOUGH).found
     finished, enough = counted.finished, True
     bounds = problem.bound_constraints
     added = [np.zeros(bound.shape) for bound in bounds] if known.added is None else split(bounds, known.added)

@@ -128,18 +128,17 @@ class Found(NamedTuple):
     counts: tuple[Integers, ...]  # of paths that violate it, by places and rows
     largest: tuple[Floats, ...]  # its largest values, in no order, (at most keep, K, rows)
 
+    @property
+    def finished(self) -> int:
+        """Number of paths with a cost."""
+        return int(np.isfinite(self.costs).sum())
+
 
 class PolicyPaths(Paths):
     """Paths of a problem under a policy: their costs, and the rows of constraints with a margin.
 
-    Args:
-        problem: The problem.
-        policy: The policy.
-        paths: Number of paths.
-        rng: Seed or generator.
-        predicted: The expected cost by the solver's model.
-        within: What no path shows of the noise cost.
-        keep: How many of the largest values of each row are kept.
+    ``predicted`` is the expected cost by the solver's model, ``within`` the part of the noise cost that no path shows;
+    of the values of each row the largest ``keep`` are kept.
     """
 
     def __init__(
@@ -170,39 +169,29 @@ class PolicyPaths(Paths):
         self.parts.append(part.found)
 
     @property
-    def costs(self) -> Floats:
-        """The cost of each path so far, NaN where one failed."""
-        return np.concatenate([part.costs for part in self.parts])
-
-    @property
-    def finished(self) -> int:
-        """Number of paths with a cost."""
-        return int(np.isfinite(self.costs).sum())
-
-    @property
-    def counts(self) -> list[Integers]:
-        """How many paths violate each constraint with a margin (K, rows)."""
-        return [np.sum(own, axis=0) for own in zip(*(part.counts for part in self.parts), strict=True)]
-
-    @property
-    def largest(self) -> list[Floats]:
-        """The largest values of these constraints, in no order (at most keep, K, rows)."""
-        every = zip(*(part.largest for part in self.parts), strict=True)
-        return [_largest(np.concatenate(own), self.keep) for own in every]
+    def found(self) -> Found:
+        """What all paths so far have shown."""
+        costs, counts, largest = zip(*self.parts, strict=True)
+        return Found(
+            np.concatenate(costs),
+            tuple(np.sum(own, axis=0) for own in zip(*counts, strict=True)),
+            tuple(_largest(np.concatenate(own), self.keep) for own in zip(*largest, strict=True)),
+        )
 
     def broken(self) -> tuple[Broken, ...]:
         """How often paths violated each constraint with a margin."""
-        found = []
-        for bound, counts in zip(with_margins(self.problem), self.counts, strict=True):
+        broken, found = [], self.found
+        for bound, counts in zip(with_margins(self.problem), found.counts, strict=True):
             place, row = np.unravel_index(int(counts.argmax()), counts.shape)
             label, time, most = self.problem.label_of(bound.source), float(bound.times[place]), int(counts.max())
-            found.append(Broken(label, bound.rows[row], time, most, self.finished, bound.source.margin))
-        return tuple(found)
+            broken.append(Broken(label, bound.rows[row], time, most, found.finished, bound.source.margin))
+        return tuple(broken)
 
     def result(self, found: tuple[Finding, ...]) -> MonteCarlo | None:
-        if self.finished < 2:
+        costs = self.found.costs
+        good = costs[np.isfinite(costs)]
+        if len(good) < 2:
             return None
-        good = self.costs[np.isfinite(self.costs)]
         return MonteCarlo(
             cost=float(good.mean()) + self.within,
             # Without noise all paths are the same, and differ by rounding.
