@@ -200,10 +200,10 @@ def test_interruption_keeps_what_is_done():
         if done == 192:
             raise KeyboardInterrupt
 
-    with refused(vp.EnsembleInterrupted) as caught:
+    with refused(vp.PathsInterrupted) as caught:
         run(paths=3000, progress=interrupt, workers=1)
     assert isinstance(caught.value, KeyboardInterrupt)
-    part, whole = caught.value.ensemble, run(paths=3000)
+    part, whole = caught.value.result, run(paths=3000)
     kept = len(part.q)
     assert 192 <= kept < 3000
     assert f"{kept} paths" in str(caught.value)
@@ -214,9 +214,9 @@ def test_interruption_keeps_what_is_done():
 
 def test_interruption_before_anything_is_done(monkeypatch):
     monkeypatch.setattr(varpin.ensemble.paths, "simulate_paths", stop)
-    with refused(vp.EnsembleInterrupted, "0") as caught:
+    with refused(vp.PathsInterrupted, "0") as caught:
         run()
-    assert caught.value.ensemble is None
+    assert caught.value.result is None
 
 
 def test_quantiles_of_very_many_paths_are_those_of_the_first(monkeypatch):
@@ -254,14 +254,14 @@ def stop(*given):
 def test_an_interrupted_ensemble_carries_warnings(monkeypatch):
     """Those of the same ensemble of as many paths; without a look after a second Ctrl-C."""
     scene = fragile_scene(2)
-    with pytest.raises(vp.EnsembleInterrupted) as caught:
+    with pytest.raises(vp.PathsInterrupted) as caught:
         run(scene, **COARSE | {"paths": 300}, progress=lambda done, total: stop())
-    part = caught.value.ensemble
+    part = caught.value.result
     assert part.warnings == run(scene, **COARSE | {"paths": int(part.statistics.count[0])}).warnings != ()
     monkeypatch.setattr(varpin.ensemble.paths, "examine", stop)
-    with pytest.raises(vp.EnsembleInterrupted) as caught:
+    with pytest.raises(vp.PathsInterrupted) as caught:
         run(scene, **COARSE | {"paths": 300}, progress=lambda done, total: stop())
-    assert caught.value.ensemble.warnings == ()
+    assert caught.value.result.warnings == ()
 
 
 def test_the_paths_that_stand_out_are_looked_at():
@@ -444,7 +444,7 @@ def test_monte_carlo_tells_of_what_its_paths_do(caplog):
     def interrupt(done, paths):
         raise KeyboardInterrupt
 
-    with pytest.raises(vp.MonteCarloInterrupted) as caught:
+    with pytest.raises(vp.PathsInterrupted) as caught:
         plan.monte_carlo(600, 0, progress=interrupt)
     assert about(caught.value.result.warnings, "error")
     for warning in found.warnings:

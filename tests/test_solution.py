@@ -169,7 +169,7 @@ def test_monte_carlo_interrupted_holds_the_paths_done():
         if done >= 64:
             raise KeyboardInterrupt
 
-    with refused(vp.MonteCarloInterrupted, "paths") as caught:
+    with refused(vp.PathsInterrupted, "paths") as caught:
         sol.monte_carlo(6000, 5, workers=1, progress=stop)
     assert len(seen) == 1
     # Those that the worker had begun are kept, too.

@@ -108,19 +108,6 @@ class MonteCarlo(Printed):
         return "\n".join([*lines, *map(str, self.broken), *(f"warning: {warning}" for warning in self.warnings)])
 
 
-class MonteCarloInterrupted(KeyboardInterrupt):
-    """Ctrl-C during :meth:`Solution.monte_carlo`.
-
-    Attributes:
-        result: The result of the paths done; None if there are fewer than two.
-    """
-
-    def __init__(self, result: MonteCarlo | None) -> None:
-        self.result = result
-        done = 0 if result is None else result.paths + result.failures
-        super().__init__(f"interrupted after {done} paths" + ("; they are in .result" if done else ""))
-
-
 class Found(NamedTuple):
     """What C paths have shown; the last two of each constraint with a margin."""
 

@@ -16,7 +16,7 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.control.between_nodes import enforced
 from varpin.control.history import Iteration, Refinement, SearchState, Status
-from varpin.control.monte_carlo import MonteCarlo, MonteCarloInterrupted, PolicyPaths
+from varpin.control.monte_carlo import MonteCarlo, PolicyPaths
 from varpin.control.multipliers import ConstraintReport, Multipliers, reports
 from varpin.control.noise import left_within_steps
 from varpin.control.problem import OptimalControlProblem, require_problem
@@ -322,7 +322,7 @@ class Solution(Frozen):
             InputError: Wrong arguments.
             ForceError, ConstraintError, NoiseError: A user's function failed in a path, which the error names.
             VarpinError: Fewer than two paths succeeded, or workers were lost.
-            MonteCarloInterrupted: Ctrl-C; holds the result of the paths done. It is a KeyboardInterrupt.
+            PathsInterrupted: Ctrl-C; holds the result of the paths done. It is a KeyboardInterrupt.
         """
         policy, gains = self.policy, Feedback(self.gains, self.previous_gains)
         if not flag("feedback", feedback):
@@ -331,7 +331,7 @@ class Solution(Frozen):
         told_motion("progress", progress, "paths done, paths in all")
         within = left_within_steps(Steps(self.problem, self.trajectory), gains) if known else 0.0
         every = PolicyPaths(self.problem, policy, paths, rng, predicted=self.expected_cost, within=within)
-        found = every.result(every.run(executor, workers, progress, MonteCarloInterrupted))
+        found = every.result(every.run(executor, workers, progress))
         if found is None:
             raise VarpinError(f"fewer than two of {paths} paths got to the end; a smaller dt may help")
         announce(logger, self.problem.scene.announced, self.problem.dt, found.warnings)

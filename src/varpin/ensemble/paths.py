@@ -16,7 +16,7 @@ import numpy as np
 
 from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands
-from varpin.ensemble.record import Ensemble, PathFailure
+from varpin.ensemble.record import Ensemble, PathFailure, PathsInterrupted
 from varpin.errors import InputError, VarpinError, WorkersLost
 from varpin.finding import Finding
 from varpin.integrators import Integrator, Segment
@@ -250,16 +250,12 @@ class Paths(ABC):
             take_all(parts, self.add, lambda: None if progress is None else progress(self.done, len(self.q0)))
 
     def run(
-        self,
-        executor: Executor | None,
-        workers: int | None,
-        progress: Callable[[int, int], None] | None,
-        interrupted: Callable[[Any], BaseException],
+        self, executor: Executor | None, workers: int | None, progress: Callable[[int, int], None] | None
     ) -> tuple[Finding, ...]:
         """Simulate all paths; findings about them.
 
-        Ctrl-C and lost workers raise errors that hold the :meth:`result` of the paths so far, ``interrupted`` for
-        Ctrl-C.
+        Raises:
+            PathsInterrupted, WorkersLost: They hold the :meth:`result` of the paths so far.
         """
         with self.executing(executor, workers) as pool:
             try:
@@ -273,7 +269,7 @@ class Paths(ABC):
                 kept = self.result((*self.lost(), *found)) if self.done else None
                 if isinstance(stop, WorkersLost):
                     raise WorkersLost(stop.__cause__, kept if isinstance(kept, Ensemble) else None) from stop.__cause__
-                raise interrupted(kept) from None
+                raise PathsInterrupted(kept, self.done) from None
 
     def findings(self, pool: Executor | None) -> tuple[Finding, ...]:
         """Findings about a few paths, each kind once, of the path with the largest value; without a pool here.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,14 +130,14 @@ class Ensemble(Printed, Frozen):
         )
 
 
-class EnsembleInterrupted(KeyboardInterrupt):
-    """Ctrl-C during an ensemble.
+class PathsInterrupted(KeyboardInterrupt):
+    """Ctrl-C while paths are simulated.
 
     Attributes:
-        ensemble: The paths that were finished, in order from the first; None if there are none.
+        result: The :class:`Ensemble` of the paths that were finished, in order from the first, or their
+            :class:`MonteCarlo`; None if they are too few.
     """
 
-    def __init__(self, ensemble: Ensemble | None) -> None:
-        self.ensemble = ensemble
-        done = 0 if ensemble is None else int(ensemble.statistics.count[0])
-        super().__init__(f"interrupted after {done} paths" + ("; they are in .ensemble" if done else ""))
+    def __init__(self, result: Any, done: int) -> None:
+        self.result = result
+        super().__init__(f"interrupted after {done} paths" + ("; they are in .result" if result is not None else ""))

@@ -13,7 +13,7 @@ import numpy as np
 
 from varpin.arrays import Floats, Integers
 from varpin.ensemble.paths import Part, Paths, Reduction, Shared, without_geometry
-from varpin.ensemble.record import Ensemble, EnsembleInterrupted, EnsembleStatistics
+from varpin.ensemble.record import Ensemble, EnsembleStatistics
 from varpin.errors import InputError, VarpinError
 from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
@@ -102,7 +102,7 @@ def simulate_ensemble(
         AssemblyError: No configuration near q0 satisfies the scene's constraints.
         VarpinError: Every path failed.
         WorkersLost: The executor has lost its workers; holds the finished paths.
-        EnsembleInterrupted: Ctrl-C; holds the finished paths. It is a KeyboardInterrupt.
+        PathsInterrupted: Ctrl-C; holds the finished paths. It is a KeyboardInterrupt.
     """
     require_scene(scene)
     dt, steps = time_steps(dt, steps, duration)
@@ -127,7 +127,7 @@ def simulate_ensemble(
     commands = commands_of(scene, integrator, controls, steps, dt)
     shared = Shared(without_geometry(scene), integrator, commands, dt, steps, children(rng, paths))
     sums = Sums(shared, start[0], start[1], levels, store=store)
-    found = sums.run(executor, workers, progress, EnsembleInterrupted)
+    found = sums.run(executor, workers, progress)
     if len(sums.failures) == paths:
         raise VarpinError(sums.failing())
     found = (*in_other_units(scene, start[0][0], start[1][0]), *moved, *_alike(scene, start), *found)
