@@ -255,17 +255,16 @@ class Trajectory(Frozen):
 
     def __post_init__(self) -> None:
         """Check shapes, on which readers rely; arrays that are left out have no columns."""
-        N, n = max(np.size(self.t) - 1, 0), len(self.joint_names)
-        m, k = (np.shape(array)[1] if np.ndim(array) == 2 else 0 for array in (self.u, self.dw))
-        left_out = {"constraint_forces": (N, len(self.constraint_labels)), "u_stages": (N, 0, m), "u_nodes": (N + 1, 0)}
-        for name, shape in left_out.items():
-            if not np.size(getattr(self, name)):
-                object.__setattr__(self, name, np.zeros(shape))
+        N, n, c = max(np.size(self.t) - 1, 0), len(self.joint_names), len(self.constraint_labels)
+        m, k, s = (np.shape(array)[1] if np.ndim(array) > 1 else 0 for array in (self.u, self.dw, self.u_stages))
+        left_out = {"constraint_forces": (N, c), "u_stages": (N, s, m), "u_nodes": (N + 1, 0)}
         shapes: dict[str, Any] = {"t": (N + 1,), "energy": (N + 1,), "u": (N, m), "dw": (N, k)} | left_out
         shapes |= dict.fromkeys("qvp" if self.error is None else ("q", "v", "p", "error"), (N + 1, n))
-        shapes |= {"u_stages": (N, *np.shape(self.u_stages)[1:2], m)}
-        shapes |= {"u_nodes": (N + 1, m)} if np.size(self.u_nodes) else {}
+        if np.size(self.u_nodes):
+            shapes["u_nodes"] = (N + 1, m)
         for name, shape in shapes.items():
+            if name in left_out and not np.size(getattr(self, name)):
+                object.__setattr__(self, name, np.zeros(shape))
             array = getattr(self, name)
             if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
                 raise InputError(f"a trajectory's {name} must be a float64 array {shape}, got {reprlib.repr(array)}")

@@ -27,7 +27,7 @@ from varpin.finding import Finding, announce
 from varpin.io.archive import Axes, members_of, read_npz, record_of, save_npz
 from varpin.linearization import velocity_at_nodes
 from varpin.signals.policy import LinearPolicy
-from varpin.support.checks import JointValues, count, flag, path_like, positive, told_motion, word
+from varpin.support.checks import JointValues, count, flag, path_like, positive, word
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, folded, listed, table, warning_count
 from varpin.trajectory import PLAN_FORMAT, Trajectory
@@ -328,7 +328,6 @@ class Solution(Frozen):
         if not flag("feedback", feedback):
             policy, gains = policy.without_feedback(), Feedback(np.zeros(self.gains.shape), None)
         paths, known = count("paths", paths, least=2), np.isfinite(self.noise_cost)
-        told_motion("progress", progress, "paths done, paths in all")
         within = left_within_steps(Steps(self.problem, self.trajectory), gains) if known else 0.0
         every = PolicyPaths(self.problem, policy, paths, rng, predicted=self.expected_cost, within=within)
         found = every.result(every.run(executor, workers, progress))

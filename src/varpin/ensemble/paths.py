@@ -29,6 +29,7 @@ from varpin.signals.commands import as_moved, lines, rows, with_ends
 from varpin.simulation.check import check
 from varpin.simulation.loop import Gains, unstable_loop
 from varpin.simulation.record import Motions
+from varpin.support.checks import told_motion
 from varpin.support.executors import executing, in_order, take_all
 from varpin.support.frozen import Frozen
 
@@ -257,6 +258,7 @@ class Paths(ABC):
         Raises:
             PathsInterrupted, WorkersLost: They hold the :meth:`result` of the paths so far.
         """
+        told_motion("progress", progress, "paths done, paths in all")
         with self.executing(executor, workers) as pool:
             try:
                 self.simulate(pool, progress)
