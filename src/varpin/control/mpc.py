@@ -131,10 +131,6 @@ class MpcRun(Printed, Frozen):
         return np.array(rows)
 
     def __repr__(self) -> str:
-        return f"MpcRun({self._summary}{warning_count(self.warnings)})"
-
-    @property
-    def _summary(self) -> str:
         text, took = f"{len(self.plans)} ticks of {1e3 * self.period:.3g} ms", 1e3 * self.seconds[1:]
         if took.size:
             text += (
@@ -143,11 +139,12 @@ class MpcRun(Printed, Frozen):
             )
         if self.budget < np.inf:
             text += f"; {int(self.late.sum())} later than {1e3 * self.budget:.3g} ms"
-        return text + (f"; {int(self.failed.sum())} failed" if self.failed.any() else "")
+        text += f"; {int(self.failed.sum())} failed" if self.failed.any() else ""
+        return f"MpcRun({text}{warning_count(self.warnings)})"
 
     def __str__(self) -> str:
         warned = (f"warning: {sentence}" for sentence in self.warnings)
-        return "\n".join([self._summary, *map(str, self.constraints), *warned])
+        return "\n".join([repr(self), *map(str, self.constraints), *warned])
 
 
 @dataclass(frozen=True)

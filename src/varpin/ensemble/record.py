@@ -114,20 +114,18 @@ class Ensemble(Printed, Frozen):
         return record_of(cls, read_npz(source, FORMAT), source)
 
     def __repr__(self) -> str:
-        return f"Ensemble({self._size()}{warning_count(self.warnings)})"
-
-    def __str__(self) -> str:
-        own = self.statistics
-        energy = f"energy [J]: {own.energy_mean[-1]:.4g} +- {own.energy_deviation[-1]:.2g} in the end"
-        return "\n".join([f"Ensemble({self._size()})", energy, *(f"warning: {own}" for own in self.warnings)])
-
-    def _size(self) -> str:
         counted = int(self.statistics.count[0])
         kept = "" if self.q is not None else ", not stored"
         lost = f", {len(self.failures)} stopped early" if self.failures else ""
         return (
-            f"{counted} paths{kept} over {len(self.t) - 1} steps, {self.t[-1] - self.t[0]:g} s, {self.integrator}{lost}"
+            f"Ensemble({counted} paths{kept} over {len(self.t) - 1} steps, {self.t[-1] - self.t[0]:g} s, "
+            f"{self.integrator}{lost}{warning_count(self.warnings)})"
         )
+
+    def __str__(self) -> str:
+        own = self.statistics
+        energy = f"energy [J]: {own.energy_mean[-1]:.4g} +- {own.energy_deviation[-1]:.2g} in the end"
+        return "\n".join([repr(self), energy, *(f"warning: {own}" for own in self.warnings)])
 
 
 class PathsInterrupted(KeyboardInterrupt):
