@@ -104,24 +104,22 @@ class EndModel(crocoddyl.ActionModelAbstract):
     def calc(self, data: Any, x: Floats, u: Floats | None = None) -> None:  # noqa: ARG002
         """The terminal cost."""
         data.xnext = x
-        q, v = _configuration_and_velocity(self._problem, x)
-        data.cost = float(self._problem.terminal.value(q[None], v[None], self._no_control)[0])
+        data.cost = float(self._problem.terminal.value(*self._end(x))[0])
 
     def calcDiff(self, data: Any, x: Floats, u: Floats | None = None) -> None:  # noqa: ARG002
         """Its derivatives."""
-        n, scene = self._problem.scene.robot.dof, self._problem.scene
-        q, v = _configuration_and_velocity(self._problem, x)
-        expansion = self._problem.terminal.expand(q[None], v[None], self._no_control)
+        n, (q, v, none) = self._problem.scene.robot.dof, self._end(x)
+        expansion = self._problem.terminal.expand(q, v, none)
         J = np.eye(2 * n)
         if self._problem.integrator.variational:
-            J[n:] = velocity_at_nodes(scene, q[None], v[None])[0]
+            J[n:] = velocity_at_nodes(self._problem.scene, q, v)[0]
         data.Fx = np.eye(2 * n)
         data.Lx = J.T @ expansion.gradient[0, : 2 * n]
         data.Lxx = J.T @ expansion.hessian[0, : 2 * n, : 2 * n] @ J
 
-    @property
-    def _no_control(self) -> Floats:
-        return np.zeros((1, self._problem.scene.controls))
+    def _end(self, x: Floats) -> tuple[Floats, Floats, Floats]:
+        q, v = _configuration_and_velocity(self._problem, x)
+        return q[None], v[None], np.zeros((1, self._problem.scene.controls))
 
 
 def shooting_problem(problem: OptimalControlProblem) -> crocoddyl.ShootingProblem:
