@@ -200,10 +200,10 @@ def test_interruption_keeps_what_is_done():
         if done == 192:
             raise KeyboardInterrupt
 
-    with refused(vp.EnsembleInterrupted) as caught:
+    with refused(vp.PathsInterrupted) as caught:
         run(paths=3000, progress=interrupt, workers=1)
     assert isinstance(caught.value, KeyboardInterrupt)
-    part, whole = caught.value.ensemble, run(paths=3000)
+    part, whole = caught.value.result, run(paths=3000)
     kept = len(part.q)
     assert 192 <= kept < 3000
     assert f"{kept} paths" in str(caught.value)
@@ -213,15 +213,15 @@ def test_interruption_keeps_what_is_done():
 
 
 def test_interruption_before_anything_is_done(monkeypatch):
-    monkeypatch.setattr(varpin.ensemble.run, "simulate_paths", stop)
-    with refused(vp.EnsembleInterrupted, "0") as caught:
+    monkeypatch.setattr(varpin.ensemble.paths, "simulate_paths", stop)
+    with refused(vp.PathsInterrupted, "0") as caught:
         run()
-    assert caught.value.ensemble is None
+    assert caught.value.result is None
 
 
 def test_quantiles_of_very_many_paths_are_those_of_the_first(monkeypatch):
     whole = run(paths=300, steps=20)
-    monkeypatch.setattr(varpin.ensemble.statistics, "_KEPT", 100 * 21 * 4)
+    monkeypatch.setattr(varpin.ensemble.run, "_KEPT", 100 * 21 * 4)
     found = run(paths=300, steps=20, store=False, workers=3).statistics
     assert (whole.statistics.quantile_paths, found.quantile_paths) == (300, 100)
     np.testing.assert_array_equal(found.quantiles, run(paths=100, steps=20).statistics.quantiles)
@@ -254,14 +254,14 @@ def stop(*given):
 def test_an_interrupted_ensemble_carries_warnings(monkeypatch):
     """Those of the same ensemble of as many paths; without a look after a second Ctrl-C."""
     scene = fragile_scene(2)
-    with pytest.raises(vp.EnsembleInterrupted) as caught:
+    with pytest.raises(vp.PathsInterrupted) as caught:
         run(scene, **COARSE | {"paths": 300}, progress=lambda done, total: stop())
-    part = caught.value.ensemble
+    part = caught.value.result
     assert part.warnings == run(scene, **COARSE | {"paths": int(part.statistics.count[0])}).warnings != ()
-    monkeypatch.setattr(varpin.ensemble.statistics, "examine", stop)
-    with pytest.raises(vp.EnsembleInterrupted) as caught:
+    monkeypatch.setattr(varpin.ensemble.paths, "examine", stop)
+    with pytest.raises(vp.PathsInterrupted) as caught:
         run(scene, **COARSE | {"paths": 300}, progress=lambda done, total: stop())
-    assert caught.value.ensemble.warnings == ()
+    assert caught.value.result.warnings == ()
 
 
 def test_the_paths_that_stand_out_are_looked_at():
@@ -272,9 +272,6 @@ def test_the_paths_that_stand_out_are_looked_at():
     assert any(warning.startswith("path 137: ") for warning in end.warnings)
 
 
-CUSTOM = vp.CustomNoise(lambda q, v, u: np.eye(2), 2)
-
-
 def policy(*shape):
     return vp.LinearPolicy(np.ones(shape[:2]), np.ones(shape), np.ones((shape[0], shape[2])))
 
@@ -283,7 +280,6 @@ def policy(*shape):
     ("options", "facts"),
     [
         ({"scene": "chain"}, ("scene", "varpin.Scene", "str")),
-        ({"scene": vp.Scene(vp.planar_chain(2), noise=CUSTOM)}, "noise"),
         ({"steps": 10**14}, ("100000000000000", "40")),
         ({"paths": 0}, ("paths", "1", "0")),
         ({"q0": np.zeros((39, 2))}, ("q0", "(40, 2)", "(39, 2)")),
@@ -298,6 +294,24 @@ def policy(*shape):
 def test_bad_input(options, facts):
     with refused(vp.InputError, facts):
         run(**options)
+
+
+def test_noise_in_python_is_that_of_the_core():
+    scenes = [
+        vp.Scene(vp.planar_chain(2), damping=0.2, noise=noise)
+        for noise in (vp.AdditiveNoise(0.3), vp.CustomNoise(lambda q, v, u: 0.3 * np.eye(2), 2))
+    ]
+    core, python = (run(scene, paths=5, steps=10) for scene in scenes)
+    np.testing.assert_allclose(python.q, core.q, rtol=1e-12)
+    same_statistics(python, core, 1e-12)
+
+
+def test_a_noise_that_fails_names_its_path():
+    far = vp.CustomNoise(lambda q, v, u: np.full((2, 2), np.nan if q[0] > 0.4 else 0.3), 2)
+    q0 = np.outer(np.arange(5) == 3, [0.39, 0.0])
+    with refused(vp.simulation.failures.NoiseError, "path 3: ", "nan") as caught:
+        run(vp.Scene(vp.planar_chain(2), noise=far), paths=5, steps=10, q0=q0)
+    assert caught.value.trajectory.steps == caught.value.step > 0
 
 
 @pytest.mark.filterwarnings("error")
@@ -376,7 +390,7 @@ def test_nothing_comes_back_that_was_not_asked_for():
     paths, steps = 2000, 50
     end = run(paths=paths, steps=steps, store=False, quantiles=(), executor=shipping)
     same_ensembles(end, run(paths=paths, steps=steps, store=False, quantiles=()))
-    numbers = (steps + 1) * (1 + 5 + 16 + 1)
+    numbers = (steps + 1) * (1 + 5 + 25)
     assert shipping.sent >= 10
     assert shipping.returned < shipping.sent * (8 * numbers + 5000) + 8 * paths
     assert shipping.most < 50_000
@@ -430,7 +444,7 @@ def test_monte_carlo_tells_of_what_its_paths_do(caplog):
     def interrupt(done, paths):
         raise KeyboardInterrupt
 
-    with pytest.raises(vp.MonteCarloInterrupted) as caught:
+    with pytest.raises(vp.PathsInterrupted) as caught:
         plan.monte_carlo(600, 0, progress=interrupt)
     assert about(caught.value.result.warnings, "error")
     for warning in found.warnings:

@@ -11,7 +11,6 @@ from oracles import Mechanism, slope
 from refusals import refused, unnamed
 
 import varpin as vp
-from varpin.control import solution_trajectory
 from varpin.linearization import linearize_steps
 
 
@@ -379,7 +378,7 @@ def test_plans_in_files_keep_their_scene(tmp_path):
     problem = vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], dt=0.02, steps=5)
     plan = vp.solve(problem, max_iterations=2)
     path = plan.save(tmp_path / "plan.npz")
-    for motion in (vp.Solution.load(path, problem).trajectory, solution_trajectory(path)):
+    for motion in (vp.Solution.load(path, problem).trajectory, vp.Trajectory.load(path)):
         assert vp.linearize(scene, motion).steps == 5
         with refused(vp.InputError, "damping"):
             vp.linearize(vp.Scene(vp.planar_chain(2)), motion)

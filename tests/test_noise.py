@@ -524,7 +524,7 @@ def test_paths_that_are_all_one_and_seeds_of_nothing_are_told_of():
     for scene, q0, paths in ((QUIET, [0, 0], 3), (QUIET, starts, 3), (noisy(), [0, 0], 3), (QUIET, [0, 0], 1)):
         told = vp.simulate_ensemble(scene, q0, [0, 0], **SHORT, paths=paths, rng=0).warnings
         same = scene is QUIET and paths > 1 and q0 is not starts
-        assert len(told) == len(about(told, "paths alike")) == same
+        assert len(told) == len(about(told, "nothing random")) == same
 
 
 def problem(scene):

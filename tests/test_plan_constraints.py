@@ -22,7 +22,6 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import varpin as vp
 from varpin import replay
-from varpin.control import ViolationOnRobot
 from varpin.control.checks import foreseen
 from varpin.model.clearance import capsule_around, clearance
 from varpin.model.kinematics import frame_kinematics
@@ -251,8 +250,8 @@ def test_verification_tells_what_the_continuous_robot_violates():
     problem = reach(speeds(1.2), tip(), steps=14, dt=0.1, integrator=vp.Midpoint(), sampling="midpoint")
     plan = vp.solve(problem, check=False)
     seen = plan.verify(tolerance=1e-8)
-    speed, goal = seen.constraints
-    assert max(speed.planned, goal.planned) <= 1e-9
+    (speed, goal), (alone, opened) = seen.constraints, seen.open_loop_constraints
+    assert plan.violation <= 1e-9
     x, fastest = np.zeros(4), 0.0
 
     def rate(_, x, torque):
@@ -263,22 +262,22 @@ def test_verification_tells_what_the_continuous_robot_violates():
         times = np.linspace(0.0, 0.1, seen.substeps + 1)
         found = solve_ivp(rate, (0.0, 0.1), x, "DOP853", rtol=1e-11, atol=1e-12, args=(torque,), t_eval=times).y
         x, fastest = found[:, -1], max(fastest, np.abs(found[2:]).max())
-    assert speed.open_loop == pytest.approx(fastest - 1.2, rel=1e-3)
+    assert alone.violation == pytest.approx(fastest - 1.2, rel=1e-3)
     end = TWO.frame_positions(x[:2], "tip")
-    assert goal.open_loop == pytest.approx(np.abs(end - [1.2, 0.0, -0.9]).max(), rel=1e-4)
-    assert speed.open_loop > 1e-3 < speed.closed_loop
-    assert goal.closed_loop < goal.open_loop
-    assert seen.violation == max(speed.closed_loop, goal.closed_loop)
+    assert opened.violation == pytest.approx(np.abs(end - [1.2, 0.0, -0.9]).max(), rel=1e-4)
+    assert alone.violation > 1e-3 < speed.violation
+    assert goal.violation < opened.violation
+    assert seen.violation == max(speed.violation, goal.violation)
     assert not unnamed(str(seen), "WithinVelocityLimits", "[rad/s]")
     assert "limit of joint" in speed.where
     far = vp.solve(reach(vp.ReachFrame(TWO, "tip", position=[2.5, 0.0, 0.0])), max_iterations=0, check=False)
-    assert far.verify().constraints[0].open_loop == pytest.approx(0.5, rel=0.1)
+    assert far.verify().open_loop_constraints[0].violation == pytest.approx(0.5, rel=0.1)
 
 
 def test_a_motion_with_feedback_that_runs_away_is_no_small_violation():
-    kept = ViolationOnRobot("one", "m", 0.0, 0.1, 0.2, "")
-    lost = ViolationOnRobot("other", "m", 0.0, 0.1, np.nan, "")
     seen = SMALL["held, speeds"].plan.verify()
+    (own,) = seen.constraints
+    kept, lost = (replace(own, values=np.full(own.values.shape, value)) for value in (0.2, np.nan))
     for constraints in ((kept, lost), (lost, kept)):
         assert np.isnan(replace(seen, constraints=constraints).violation)
     assert replace(seen, constraints=(kept,)).violation == 0.2

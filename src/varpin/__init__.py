@@ -100,7 +100,6 @@ if TYPE_CHECKING:
     from varpin.control import ConstraintReport as ConstraintReport
     from varpin.control import Iteration as Iteration
     from varpin.control import MonteCarlo as MonteCarlo
-    from varpin.control import MonteCarloInterrupted as MonteCarloInterrupted
     from varpin.control import Multipliers as Multipliers
     from varpin.control import OptimalControlProblem as OptimalControlProblem
     from varpin.control import Refined as Refined
@@ -109,7 +108,6 @@ if TYPE_CHECKING:
     from varpin.control import Solution as Solution
     from varpin.control import Status as Status
     from varpin.control import Verification as Verification
-    from varpin.control import ViolationOnRobot as ViolationOnRobot
     from varpin.control import solve as solve
     from varpin.control.constraints import KeepClear as KeepClear
     from varpin.control.constraints import KeepInBox as KeepInBox
@@ -143,9 +141,9 @@ if TYPE_CHECKING:
     from varpin.control.mpc import MpcRun as MpcRun
     from varpin.control.mpc import Plant as Plant
     from varpin.ensemble import Ensemble as Ensemble
-    from varpin.ensemble import EnsembleInterrupted as EnsembleInterrupted
     from varpin.ensemble import EnsembleStatistics as EnsembleStatistics
     from varpin.ensemble import PathFailure as PathFailure
+    from varpin.ensemble import PathsInterrupted as PathsInterrupted
     from varpin.ensemble import simulate_ensemble as simulate_ensemble
     from varpin.estimation import Estimate as Estimate
     from varpin.estimation import Gradient as Gradient
@@ -190,9 +188,9 @@ if TYPE_CHECKING:
 # The names of the block above by their modules, which are imported with the first use of a name.
 _LATE = {
     "varpin.control": (
-        "ConstraintReport Iteration MonteCarlo MonteCarloInterrupted Multipliers "
+        "ConstraintReport Iteration MonteCarlo Multipliers "
         "OptimalControlProblem Refined Refinement SearchState Solution Status "
-        "Verification ViolationOnRobot solve"
+        "Verification solve"
     ),
     "varpin.control.constraints": (
         "KeepClear KeepInBox KeepInHalfSpace KeepInSphere KeepOutOfSphere "
@@ -206,7 +204,7 @@ _LATE = {
         "TrackingCost VelocityCost VelocityLimitBarrier"
     ),
     "varpin.control.mpc": "Mpc MpcRun Plant",
-    "varpin.ensemble": ("Ensemble EnsembleInterrupted EnsembleStatistics PathFailure simulate_ensemble"),
+    "varpin.ensemble": ("Ensemble EnsembleStatistics PathFailure PathsInterrupted simulate_ensemble"),
     "varpin.estimation": (
         "Estimate Gradient Identification Log Sensitivities identify kalman_filter sensitivities smooth"
     ),

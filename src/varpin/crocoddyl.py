@@ -12,8 +12,7 @@ Needs crocoddyl, which is built against one version of Pinocchio: ``pip install 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -56,7 +55,6 @@ class StepModel(crocoddyl.ActionModelAbstract):
     def __init__(self, problem: OptimalControlProblem) -> None:
         super().__init__(crocoddyl.StateVector(2 * problem.scene.robot.dof), problem.scene.controls, 0)
         self._problem = problem
-        self._known: tuple[Floats, Floats, Trajectory] | None = None
         if problem.limited:
             self.u_lb, self.u_ub = np.clip(problem.control_limits, -_NO_LIMIT, _NO_LIMIT)
 
@@ -83,11 +81,9 @@ class StepModel(crocoddyl.ActionModelAbstract):
         data.Lxx, data.Lxu, data.Luu = hessian[at, at], hessian[at, by], hessian[by, by]
 
     def _step(self, x: Floats, u: Floats | None) -> Trajectory | None:
-        """The step from x under u. The last one is cached, as crocoddyl needs its derivatives next."""
+        """The step from x under u."""
         problem = self._problem
         u = np.zeros(problem.scene.controls) if u is None else u
-        if self._known is not None and np.array_equal(self._known[0], x) and np.array_equal(self._known[1], u):
-            return self._known[2]
         q, v = _configuration_and_velocity(problem, x)
         if not (np.isfinite(q).all() and np.isfinite(v).all() and np.isfinite(u).all()):
             return None
@@ -95,7 +91,6 @@ class StepModel(crocoddyl.ActionModelAbstract):
         if failure is not None:
             logger.warning("a step cannot be solved: %s", failure.reason)
             return None
-        self._known = x.copy(), u.copy(), motion
         return motion
 
 
@@ -109,24 +104,22 @@ class EndModel(crocoddyl.ActionModelAbstract):
     def calc(self, data: Any, x: Floats, u: Floats | None = None) -> None:  # noqa: ARG002
         """The terminal cost."""
         data.xnext = x
-        q, v = _configuration_and_velocity(self._problem, x)
-        data.cost = float(self._problem.terminal.value(q[None], v[None], self._no_control)[0])
+        data.cost = float(self._problem.terminal.value(*self._end(x))[0])
 
     def calcDiff(self, data: Any, x: Floats, u: Floats | None = None) -> None:  # noqa: ARG002
         """Its derivatives."""
-        n, scene = self._problem.scene.robot.dof, self._problem.scene
-        q, v = _configuration_and_velocity(self._problem, x)
-        expansion = self._problem.terminal.expand(q[None], v[None], self._no_control)
+        n, (q, v, none) = self._problem.scene.robot.dof, self._end(x)
+        expansion = self._problem.terminal.expand(q, v, none)
         J = np.eye(2 * n)
         if self._problem.integrator.variational:
-            J[n:] = velocity_at_nodes(scene, q[None], v[None])[0]
+            J[n:] = velocity_at_nodes(self._problem.scene, q, v)[0]
         data.Fx = np.eye(2 * n)
         data.Lx = J.T @ expansion.gradient[0, : 2 * n]
         data.Lxx = J.T @ expansion.hessian[0, : 2 * n, : 2 * n] @ J
 
-    @property
-    def _no_control(self) -> Floats:
-        return np.zeros((1, self._problem.scene.controls))
+    def _end(self, x: Floats) -> tuple[Floats, Floats, Floats]:
+        q, v = _configuration_and_velocity(self._problem, x)
+        return q[None], v[None], np.zeros((1, self._problem.scene.controls))
 
 
 def shooting_problem(problem: OptimalControlProblem) -> crocoddyl.ShootingProblem:
@@ -165,16 +158,9 @@ def first_guess(problem: OptimalControlProblem) -> tuple[list[Floats], list[Floa
 
 def policy_of(problem: OptimalControlProblem, solver: Any) -> LinearPolicy:
     """The policy us - K (x - xs), within the control limits, of a solver of ``shooting_problem(problem)``."""
-    gains: Sequence[Floats] = solver.K
-    return LinearPolicy(
-        np.array(solver.us.tolist()),
-        -np.array(gains.tolist() if hasattr(gains, "tolist") else gains),
-        np.array(solver.xs.tolist())[:-1],
-        on="momentum" if problem.integrator.variational else "velocity",
-        limits=(problem.control_limits[0], problem.control_limits[1]),
-        period=problem.period,
-        joints=problem.scene.control_joints,
-    )
+    gains = -np.array(list(solver.K))
+    on: Literal["momentum", "velocity"] = "momentum" if problem.integrator.variational else "velocity"
+    return problem.policy_of(np.array(solver.us.tolist()), gains, np.array(solver.xs.tolist())[:-1], on)
 
 
 def _configuration_and_velocity(problem: OptimalControlProblem, x: Floats) -> tuple[Floats, Floats]:

@@ -27,6 +27,8 @@ from varpin.support.markup import facts, table, warning_count
 Bytes = NDArray[np.uint8]
 
 FORMAT = "varpin.trajectory/2"
+# Of the files of plans, which have a motion, too.
+PLAN_FORMAT = "varpin.solution/5"
 
 T = TypeVar("T")
 
@@ -253,31 +255,21 @@ class Trajectory(Frozen):
 
     def __post_init__(self) -> None:
         """Check shapes, on which readers rely; arrays that are left out have no columns."""
-        N, n = max(np.size(self.t) - 1, 0), len(self.joint_names)
-        m, k = (np.shape(array)[1] if np.ndim(array) == 2 else 0 for array in (self.u, self.dw))
-        left_out = {"constraint_forces": (N, len(self.constraint_labels)), "u_stages": (N, 0, m), "u_nodes": (N + 1, 0)}
-        for name, shape in left_out.items():
-            if not np.size(getattr(self, name)):
-                object.__setattr__(self, name, np.zeros(shape))
+        N, n, c = max(np.size(self.t) - 1, 0), len(self.joint_names), len(self.constraint_labels)
+        m, k, s = (np.shape(array)[1] if np.ndim(array) > 1 else 0 for array in (self.u, self.dw, self.u_stages))
+        left_out = {"constraint_forces": (N, c), "u_stages": (N, s, m), "u_nodes": (N + 1, 0)}
         shapes: dict[str, Any] = {"t": (N + 1,), "energy": (N + 1,), "u": (N, m), "dw": (N, k)} | left_out
         shapes |= dict.fromkeys("qvp" if self.error is None else ("q", "v", "p", "error"), (N + 1, n))
-        shapes |= {"u_stages": (N, *np.shape(self.u_stages)[1:2], m)}
-        shapes |= {"u_nodes": (N + 1, m)} if np.size(self.u_nodes) else {}
+        if np.size(self.u_nodes):
+            shapes["u_nodes"] = (N + 1, m)
         for name, shape in shapes.items():
+            if name in left_out and not np.size(getattr(self, name)):
+                object.__setattr__(self, name, np.zeros(shape))
             array = getattr(self, name)
             if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
                 raise InputError(f"a trajectory's {name} must be a float64 array {shape}, got {reprlib.repr(array)}")
         _sealed(self.statistics)
         _sealed(self)
-
-    @classmethod
-    def assembled(cls, **values: Any) -> Trajectory:
-        """A trajectory of all its attributes, with arrays that are known to fit each other; they become read-only."""
-        made = object.__new__(cls)
-        # The frozen dataclass refuses assignments.
-        vars(made).update(values)
-        _sealed(made.statistics)
-        return _sealed(made)
 
     @property
     def steps(self) -> int:
@@ -369,7 +361,7 @@ class Trajectory(Frozen):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], robot: Robot | None = None) -> Trajectory:
-        """Read a trajectory that :meth:`save` wrote.
+        """Read a trajectory that :meth:`save` wrote, or that of a plan that :meth:`Solution.save` wrote.
 
         Args:
             path: The npz file.
@@ -383,7 +375,7 @@ class Trajectory(Frozen):
         source = path_like("path", path)
         if robot is not None:
             require_robot(robot)
-        return cls.of_members(source, read_npz(source, FORMAT), robot)
+        return cls.of_members(source, read_npz(source, FORMAT, PLAN_FORMAT), robot)
 
     @classmethod
     def of_members(cls, source: Path, members: Mapping[str, Any], robot: Robot | None) -> Trajectory:
@@ -397,24 +389,21 @@ class Trajectory(Frozen):
             raise FileError(f"{source}: its times t are not dt = {found.dt} s apart")
         if not found.statistics.whole:
             raise FileError(f"{source}: statistics.substeps and statistics.halvings are not those of whole steps")
-        if robot is not None:
-            found._require_robot(source, robot)
-        return found
-
-    def _require_robot(self, source: Path, robot: Robot) -> None:
-        """Refuse a robot with other joints or masses than those of the motion in the file ``source``."""
-        if self.joint_names != robot.joint_names:
+        if robot is None:
+            return found
+        if found.joint_names != robot.joint_names:
             raise FileError(
-                f"{source} is of robot {self.robot} with joints {', '.join(self.joint_names)}; "
+                f"{source} is of robot {found.robot} with joints {', '.join(found.joint_names)}; "
                 f"{robot.name!r} has joints {', '.join(robot.joint_names)}"
             )
         masses = robot.tree.mass
-        if self.masses.shape != masses.shape or not np.allclose(self.masses, masses, rtol=1e-6):
+        if found.masses.shape != masses.shape or not np.allclose(found.masses, masses, rtol=1e-6):
             raise FileError(
-                f"{source} is of robot {self.robot}, whose links weigh {self.masses.sum():.6g} kg, and those of "
+                f"{source} is of robot {found.robot}, whose links weigh {found.masses.sum():.6g} kg, and those of "
                 f"{robot.name!r} {masses.sum():.6g} kg: load the robot with its payloads, for varpin replay by a scene "
                 "file as --robot"
             )
+        return found
 
 
 def require_trajectory(motion: object) -> Trajectory:

@@ -21,15 +21,12 @@ from varpin.cli.arguments import (
 )
 from varpin.cli.console import say, show
 from varpin.cli.outputs import add_replay_options, speed_of, write_all, writers_of
-from varpin.control import solution_trajectory
 from varpin.errors import InputError, RobotNotFound
-from varpin.io.archive import read_format
 from varpin.io.scenefile import SceneFile
 from varpin.marks import Marks
 from varpin.model import Robot, load_robot, robot_names
 from varpin.show.given import frame_names
 from varpin.show.inspection import inspect_robot
-from varpin.support.checks import path_like
 from varpin.support.tables import Table
 from varpin.trajectory import Trajectory
 
@@ -50,11 +47,11 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
 
 
 def _replay(request: argparse.Namespace, errors: Console) -> int:
-    first = _motion(request.motion)
+    first = Trajectory.load(request.motion)
     robot, scene = _robot(request, first)
-    motion = _motion(request.motion, robot)
+    motion = Trajectory.load(request.motion, robot)
     marks = Marks() if scene is None else scene.marks(motion.duration)
-    ghost = marks.ghost if request.ghost is None else _motion(request.ghost, robot)
+    ghost = marks.ghost if request.ghost is None else Trajectory.load(request.ghost, robot)
     trace = request.trace or marks.trace
     for name, frames in (("trace", trace), ("frames", request.frames)):
         frame_names(f"--{name}", [robot], frames)
@@ -80,13 +77,6 @@ def _window(request: argparse.Namespace, errors: Console, robot: Robot, motion: 
             time.sleep(3600.0)
     except KeyboardInterrupt:
         return 0
-
-
-def _motion(path: Path, robot: Robot | None = None) -> Trajectory:
-    """The trajectory in a file, which contains a trajectory or a solution."""
-    source = path_like("NPZ", path)
-    solution = read_format(source).startswith("varpin.solution/")
-    return solution_trajectory(source, robot) if solution else Trajectory.load(source, robot)
 
 
 def _robot(request: argparse.Namespace, motion: Trajectory) -> tuple[Robot, SceneFile | None]:

@@ -6,12 +6,9 @@ from varpin.control.history import Refinement as Refinement
 from varpin.control.history import SearchState as SearchState
 from varpin.control.history import Status as Status
 from varpin.control.monte_carlo import MonteCarlo as MonteCarlo
-from varpin.control.monte_carlo import MonteCarloInterrupted as MonteCarloInterrupted
 from varpin.control.multipliers import ConstraintReport as ConstraintReport
 from varpin.control.multipliers import Multipliers as Multipliers
 from varpin.control.problem import OptimalControlProblem as OptimalControlProblem
 from varpin.control.solution import Solution as Solution
-from varpin.control.solution import solution_trajectory as solution_trajectory
 from varpin.control.solving import solve as solve
 from varpin.control.verification import Verification as Verification
-from varpin.control.verification import ViolationOnRobot as ViolationOnRobot

@@ -240,9 +240,7 @@ def _dearer(solution: Solution, again: Sequence[Played]) -> Finding | None:
     if -NOTABLE <= lost[1] <= SLIGHT:
         return None
     alone, fed = (percent(part) if np.isfinite(part) else "runs away" for part in lost)
-    advice = f"problem.at(dt={problem.dt / _PARTS:g}, hold={problem.hold * _PARTS}) decides as often in finer steps"
-    if problem.linear or problem.scene.inputs:
-        advice = f"problem.at(dt={problem.dt / _PARTS:g}) has finer steps"
+    advice = f"{_finer(problem, _PARTS)} has finer steps"
     if problem.sampling != "gauss":
         advice = f"sampling='gauss' sees the motion within steps, {problem.sampling!r} does not"
     sentence = (
@@ -250,6 +248,12 @@ def _dearer(solution: Solution, again: Sequence[Played]) -> Finding | None:
         f"controls alone {alone}: {advice}"
     )
     return Finding("replay", sentence)
+
+
+def _finer(problem: OptimalControlProblem, parts: int) -> str:
+    """The call that gives the problem finer steps and as many decisions."""
+    hold = "" if problem.linear or problem.scene.inputs else f", hold={problem.hold * parts}"
+    return f"problem.at(dt={problem.dt / parts:g}{hold})"
 
 
 def _between(solution: Solution, again: Sequence[Played]) -> Iterator[Finding]:
@@ -262,17 +266,17 @@ def _between(solution: Solution, again: Sequence[Played]) -> Iterator[Finding]:
     if np.isnan(away).all():
         return
     for bound, outside in zip(problem.bound_constraints, again[int(np.nanargmin(away))].outside, strict=True):
-        if bound.of_controls or bound.source.equality or outside.worst <= NOTABLE * bound.scale:
+        if bound.of_controls or bound.source.equality or outside.violation <= NOTABLE * bound.scale:
             continue
         advice = "a smaller dt or a bound narrower by that much keeps it there"
         if not (problem.linear or problem.between_nodes):
             advice = f"between_nodes=True, {advice}"
         sentence = (
-            f"{problem.label_of(bound.source)} holds at the nodes, but between nodes {outside.row} is violated by "
-            f"{outside.worst:.2g} {bound.unit} at t = {outside.time:.4g} s: {advice}"
+            f"{outside.label} holds at the nodes, but between nodes it is violated by {outside.violation:.2g} "
+            f"{bound.unit}, {outside.where}: {advice}"
         )
-        kind = "constraints between nodes"
-        yield Finding(kind, sentence, time=outside.time, value=outside.worst, unit=bound.unit)
+        time = float(outside.t[outside.excess.max(axis=1).argmax()])
+        yield Finding("constraints between nodes", sentence, time=time, value=outside.violation, unit=bound.unit)
 
 
 # Noise
@@ -339,9 +343,8 @@ def _in_halves(solution: Solution) -> Iterator[Finding]:
     planned = noise_cost(Steps(problem, solution.trajectory), feedback)
     cost = noise_cost(Steps(fine, finer), feedback, halves=problem.linear)
     if abs(cost - planned) > NOTABLE * (abs(solution.cost) + max(planned, cost)):
-        closer = f"problem.at(dt={fine.dt:g}{'' if problem.linear else f', hold={fine.hold}'})"
         sentence = (
             f"noise costs {cost:.3g} in half steps and {planned:.3g} in the plan's of dt = {problem.dt:g} s, as "
-            f"plan.monte_carlo() does: the robot is nearer to the former, and {closer} is closer"
+            f"plan.monte_carlo() does: the robot is nearer to the former, and {_finer(problem, 2)} is closer"
         )
         yield Finding("noise within steps", sentence, value=cost)

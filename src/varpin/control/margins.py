@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr, ndtri
@@ -13,7 +12,7 @@ from varpin.arrays import Floats
 from varpin.control.between_nodes import NOWHERE, Instants
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import Status
-from varpin.control.monte_carlo import Paths, found_by, joined, with_margins
+from varpin.control.monte_carlo import PolicyPaths, with_margins
 from varpin.control.multipliers import at_nodes, split
 from varpin.control.noise import deviations
 from varpin.control.problem import OptimalControlProblem
@@ -23,8 +22,6 @@ from varpin.control.solution import Solution
 from varpin.control.stages import Feedback, Steps
 from varpin.errors import VarpinError
 from varpin.finding import Finding
-from varpin.mechanics.wiener import children
-from varpin.support.executors import executing
 
 # How often margins are widened by counting motions; from 2 to 5.
 _COUNTS = 3
@@ -42,42 +39,21 @@ _DOUBT = 3.0
 _SEARCH, _WARN = (0x76A3, 0), (0x76A3, 1)
 
 
-class _Counted(NamedTuple):
-    """What motions under noise have shown of a constraint with a margin."""
-
-    bound: BoundConstraint
-    share: Floats  # of the motions that violate each row (K, rows)
-    needed: Floats  # distances from the plan that motions exceed as often as promised (K, rows)
-    promised: float  # share that the margin allows
-    error: float  # standard error of such a share
-
-
-def _counted(plan: Solution, seed: tuple[int, ...]) -> list[_Counted]:
-    """Motions of a plan's policy under noise, counted.
+def _counted(plan: Solution, seed: tuple[int, ...], keep: int = 0) -> PolicyPaths:
+    """Motions of a plan's policy under noise, of which ``keep`` or as many as margins allow are kept at each row.
 
     Raises:
         VarpinError: Fewer than half of the motions get to the end.
     """
-    problem, motion = plan.problem, plan.trajectory
-    bounds, paths = with_margins(problem), _MOTIONS // 4 if problem.scene.noise.diffusion is None else _MOTIONS
-    keep = max(_ENOUGH, *(math.ceil(paths * ndtr(-bound.source.margin)) for bound in bounds))
-    every = Paths.of(problem, plan.policy, children(np.random.default_rng(seed), paths), paths, keep)
-    with executing(None, None) as pool:
-        found = joined(list(found_by(every, pool)), keep)
-    finished = int(np.isfinite(found.costs).sum())
-    if 2 * finished < paths:
+    problem = plan.problem
+    paths = _MOTIONS // 4 if problem.scene.noise.diffusion is None else _MOTIONS
+    keep = max(keep, *(math.ceil(paths * ndtr(-bound.source.margin)) for bound in with_margins(problem)))
+    every = PolicyPaths(problem, plan.policy, paths, np.random.default_rng(seed), keep=keep)
+    with every.executing(None, None) as pool:
+        every.simulate(pool)
+    if 2 * (finished := every.found.finished) < paths:
         raise VarpinError(f"{paths - finished} of {paths} motions under noise fail")
-    rows = []
-    for bound, counts, largest in zip(bounds, found.counts, found.largest, strict=True):
-        promised = float(ndtr(-bound.source.margin))
-        error = math.sqrt(promised * (1.0 - promised) / finished)
-        # Where too few motions are beyond, a quantile of more of them, as far as a normal distribution has it to.
-        often = max(round(finished * (promised - error)), _ENOUGH)
-        planned = bound.value(motion.q, motion.v, problem.control_rows(motion))
-        distance = np.partition(largest, len(largest) - often, axis=0)[len(largest) - often] - planned
-        needed = distance * max(1.0, bound.source.margin / -float(ndtri(often / finished)))
-        rows.append(_Counted(bound, counts / finished, needed, promised, error))
-    return rows
+    return every
 
 
 def widened(plan: Solution) -> list[Floats] | None:
@@ -90,20 +66,27 @@ def widened(plan: Solution) -> list[Floats] | None:
     Raises:
         VarpinError: Motions cannot be counted: most fail.
     """
-    problem, known = plan.problem, plan.multipliers
+    problem, motion, known = plan.problem, plan.trajectory, plan.multipliers
     if problem.scene.noise.diffusion is None or known is None:
         return None
     # The same noise in every count: what is left of a violation is then that of the plan, not of other noise.
-    counted = {id(row.bound): row for row in _counted(plan, _SEARCH)}
-    if all((row.share <= row.promised + row.error).all() for row in counted.values()):
-        return None
+    counted = _counted(plan, _SEARCH, _ENOUGH).found
+    finished, enough = counted.finished, True
     bounds = problem.bound_constraints
     added = [np.zeros(bound.shape) for bound in bounds] if known.added is None else split(bounds, known.added)
     margins = at_nodes(problem, known, known.backoff)
-    return [
-        np.maximum(counted[id(bound)].needed - margin + more, more) if id(bound) in counted else more
-        for bound, margin, more in zip(bounds, margins, added, strict=True)
-    ]
+    own = (i for i, bound in enumerate(bounds) if bound.source.margin > 0.0)
+    for i, counts, largest in zip(own, counted.counts, counted.largest, strict=True):
+        bound, promised = bounds[i], float(ndtr(-bounds[i].source.margin))
+        error = math.sqrt(promised * (1.0 - promised) / finished)
+        enough = enough and bool((counts / finished <= promised + error).all())
+        # Where too few motions are beyond, a quantile of more of them, as far as a normal distribution has it to.
+        often = max(round(finished * (promised - error)), _ENOUGH)
+        planned = bound.value(motion.q, motion.v, problem.control_rows(motion))
+        distance = np.partition(largest, len(largest) - often, axis=0)[len(largest) - often] - planned
+        needed = distance * max(1.0, bound.source.margin / -float(ndtri(often / finished)))
+        added[i] = np.maximum(needed - margins[i] + added[i], added[i])
+    return None if enough else added
 
 
 def too_small(solution: Solution) -> list[Finding]:
@@ -116,17 +99,15 @@ def too_small(solution: Solution) -> list[Finding]:
     except VarpinError as error:
         return [Finding("margins not counted", f"how often motions violate bounds with a margin= is unknown: {error}")]
     found = []
-    for row in counted:
-        place, r = np.unravel_index(int(row.share.argmax()), row.share.shape)
-        share, time = float(row.share[place, r]), float(row.bound.times[place])
-        if share <= row.promised + _DOUBT * row.error:
+    for own in counted.broken():
+        if own.share <= own.promised + _DOUBT * math.sqrt(own.promised * (1.0 - own.promised) / own.paths):
             continue
         sentence = (
-            f"{problem.label_of(row.bound.source)}: margin={row.bound.source.margin:g} is too small for this noise, as "
-            f"{row.bound.rows[r]} at t = {time:.4g} s is violated by {100.0 * share:.3g} % of motions, not "
-            f"{100.0 * row.promised:.2g} %; less noise, a greater margin or a wider bound may do"
+            f"{own.label}: margin={own.margin:g} is too small for this noise, as {own.row} at t = {own.time:.4g} s is "
+            f"violated by {100.0 * own.share:.3g} % of motions, not {100.0 * own.promised:.2g} %; less noise, a "
+            "greater margin or a wider bound may do"
         )
-        found.append(Finding("small margin", sentence, time=time, value=share))
+        found.append(Finding("small margin", sentence, time=own.time, value=own.share))
     return found
 
 

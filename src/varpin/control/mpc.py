@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ from varpin.control.rollout import first_commands
 from varpin.control.search import Search
 from varpin.control.sizes import NOTABLE, TENTH
 from varpin.control.solving import searched
+from varpin.control.verification import report_of
 from varpin.errors import ControlError, InputError, LinearizationError
 from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
@@ -38,7 +40,7 @@ from varpin.simulation.record import Progress
 from varpin.simulation.simulate import noise_forgotten, simulate
 from varpin.support.checks import JointValues, control_values, count, positive, real, told_motion
 from varpin.support.frozen import Frozen
-from varpin.support.markup import facts, warning_count
+from varpin.support.markup import Printed, facts, warning_count
 from varpin.support.one_thread import one_thread
 from varpin.trajectory import Nodes, Trajectory
 
@@ -70,7 +72,7 @@ class Plant:
 
 
 @dataclass(frozen=True, eq=False)
-class MpcRun(Frozen):
+class MpcRun(Printed, Frozen):
     """The result of a controller's run on a plant.
 
     Attributes:
@@ -129,10 +131,6 @@ class MpcRun(Frozen):
         return np.array(rows)
 
     def __repr__(self) -> str:
-        return f"MpcRun({self._summary}{warning_count(self.warnings)})"
-
-    @property
-    def _summary(self) -> str:
         text, took = f"{len(self.plans)} ticks of {1e3 * self.period:.3g} ms", 1e3 * self.seconds[1:]
         if took.size:
             text += (
@@ -141,17 +139,12 @@ class MpcRun(Frozen):
             )
         if self.budget < np.inf:
             text += f"; {int(self.late.sum())} later than {1e3 * self.budget:.3g} ms"
-        return text + (f"; {int(self.failed.sum())} failed" if self.failed.any() else "")
-
-    def _repr_html_(self) -> str:
-        rows = [("ticks", self._summary), ("plant", self.motion)]
-        rows += [("constraint", report) for report in self.constraints]
-        rows += [("warning", sentence) for sentence in self.warnings]
-        return facts(f"Run of a controller of {self.motion.robot}", rows)
+        text += f"; {int(self.failed.sum())} failed" if self.failed.any() else ""
+        return f"MpcRun({text}{warning_count(self.warnings)})"
 
     def __str__(self) -> str:
         warned = (f"warning: {sentence}" for sentence in self.warnings)
-        return "\n".join([self._summary, *map(str, self.constraints), *warned])
+        return "\n".join([repr(self), *map(str, self.constraints), *warned])
 
 
 @dataclass(frozen=True)
@@ -165,9 +158,9 @@ class Mpc:
     Controls that are linear between nodes follow the plan's first line over the tick. The next plan's line begins at a
     control of its own, which reacts to the measured state at once; a :class:`ControlRateCost` makes the jump small.
 
-    Constraints hold along every horizon to the accuracy of few iterations, which ``Solution.violation`` has; a goal
-    (:class:`ReachFrame`) applies to the end of every horizon. The size of a margin is that of the first plan. After it
-    constraints also hold in the middles of steps with ``between_nodes`` or linear controls, and else at the nodes.
+    Constraints hold along every horizon to the accuracy of few iterations, which ``Solution.violation`` has: at the
+    nodes, and in the middles of steps with ``between_nodes`` or linear controls. A goal (:class:`ReachFrame`) applies
+    to the end of every horizon. The size of a margin is that of the first plan.
 
     Main args:
         problem: The problem. Its horizon, discretization, noise, limits and constraints apply to every tick, its
@@ -300,11 +293,11 @@ class Mpc:
         scene, start, dt = plant.scene, (self.problem.q0, self.problem.v0), self.period / plant.substeps
         noisy = drawn is not None and scene.processes > 0
         method = plant.integrator or usual_integrator(scene, *start, dt, noisy=noisy)
-        given: dict[str, Any] = {"dt": dt, "steps": ticks * plant.substeps, "integrator": method}
-        given |= {"rng": drawn} if noisy else {"increments": 0.0}
+        noise: dict[str, Any] = {"rng": drawn} if noisy else {"increments": 0.0}
         try:
             # The run is checked, and its findings logged, at the end.
-            motion = simulate(scene, *start, controls=loop, check=False, **given)
+            steps = ticks * plant.substeps
+            motion = simulate(scene, *start, dt=dt, steps=steps, controls=loop, integrator=method, check=False, **noise)
         except ControlError as error:
             cause = error.__cause__
             if isinstance(cause, CostError):
@@ -327,13 +320,14 @@ class Mpc:
         announce(logger, scene.announced, dt, found)
         again = {(finding.kind, finding.joint) for finding in found}
         first = (finding for finding in loop.ticks[0].plan.warnings if (finding.kind, finding.joint) not in again)
+        plans, _, seconds, iterations, late, failures = zip(*loop.ticks, strict=True)
         return MpcRun(
             motion,
-            tuple(tick.plan for tick in loop.ticks),
-            np.array([tick.seconds for tick in loop.ticks]),
-            np.array([tick.iterations for tick in loop.ticks], dtype=np.int64),
-            np.array([tick.late for tick in loop.ticks]),
-            np.array([bool(tick.failure) for tick in loop.ticks]),
+            plans,
+            np.array(seconds),
+            np.array(iterations, dtype=np.int64),
+            np.array(late),
+            np.array(failures) != "",
             self.period,
             self.budget,
             constraints=constraints,
@@ -427,9 +421,9 @@ class _Loop:
         rows = (tick.plan.policy.feedback[min(tick.age, _lines(tick.plan) - 1)] for tick in self.ticks)
         return Gains(np.array(list(rows)), self.problem.integrator.variational)
 
-    def without_plans(self) -> list[Finding]:
+    def without_plans(self) -> Iterator[Finding]:
         """Warnings if more than a few plans took longer than the budget or the period, or searches found no plan."""
-        ticks, period, found = self.ticks[1:], self.controller.period, []
+        ticks, period = self.ticks[1:], self.controller.period
         seconds, limit = np.array([tick.seconds for tick in ticks]), min(period, self.controller.budget)
         slow, failed = int((seconds > limit).sum()), [tick.failure for tick in ticks if tick.failure]
         if slow > _FEW * len(ticks):
@@ -438,22 +432,21 @@ class _Loop:
                 f"({1e3 * seconds.mean():.3g} ms in the mean). Use fewer steps, fewer iterations, a larger budget or a "
                 "longer period (hold=)"
             )
-            found.append(Finding("late plans", text))
+            yield Finding("late plans", text)
         if failed:
             first = [bool(tick.failure) for tick in self.ticks].index(True) * period
             text = (
                 f"in {len(failed)} of {len(ticks)} ticks no plan was found and an older one acted, at t = {first:.4g} "
                 f"s for the first time: {failed[0]}"
             )
-            found.append(Finding("failed ticks", text))
+            yield Finding("failed ticks", text)
         ended = [tick.age >= _lines(tick.plan) for tick in self.ticks]
         if any(ended):
             text = (
                 f"no plan came for a whole horizon, and from t = {ended.index(True) * period:.4g} s on the last "
                 "control was held: use a longer horizon, a larger budget, or more iterations a tick"
             )
-            found.append(Finding("plan at its end", text))
-        return found
+            yield Finding("plan at its end", text)
 
     def constraints(self, motion: Trajectory) -> tuple[tuple[ConstraintReport, ...], list[Finding]]:
         """How well the plant's motion satisfied each constraint, and warnings about it and about plans."""
@@ -475,8 +468,7 @@ class _Loop:
                 found.append(Finding("infeasible ticks", text))
             if bound.source.equality:
                 continue
-            c = bound.value(motion.q, motion.v, motion.u)
-            reports.append(ConstraintReport(label, bound.rows, bound.unit, bound.times, c, np.zeros_like(c), False))
+            reports.append(report_of(problem, bound, bound.value(motion.q, motion.v, motion.u)))
             if (worst := reports[-1].violation) > NOTABLE * bound.scale:
                 text = (
                     f"the plant's motion violates {label} by {worst:.2g} {bound.unit}, {reports[-1].where}. Use a "

@@ -465,13 +465,11 @@ class OptimalControlProblem(Frozen):
         gains: Floats,
         reference: Floats,
         on: Literal["momentum", "velocity"] | None,
-        *,
-        substeps: int = 1,
         **options: Any,
     ) -> LinearPolicy:
-        """A policy of the problem's decisions, in ``substeps`` parts of its steps; ``options`` as for the policy."""
+        """A policy of the problem's decisions; ``options`` as for the policy."""
         scene, limits = self.scene, (self.control_limits[0], self.control_limits[1])
-        options |= {"limits": limits, "period": self.period, "linear": self.linear, "hold": self.hold * substeps}
+        options |= {"limits": limits, "period": self.period, "linear": self.linear, "hold": self.hold}
         options |= {"joints": scene.control_joints, "servos": scene.servo_joints}
         if scene.processes and self.integrator.variational == (on == "momentum"):
             # Feedback and margins are for the noise as this method takes it.

@@ -14,7 +14,7 @@ from varpin.control.history import Refined, Refinement, Status, part
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.sizes import FEASIBLE, SLIGHT, TENTH
 from varpin.control.solution import Solution
-from varpin.control.verification import Verification, excess, verify
+from varpin.control.verification import excess, verify
 from varpin.errors import VarpinError
 from varpin.trajectory import Trajectory
 
@@ -50,13 +50,18 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
             plan = plan or record.search(problem, start)
             compares = record.add(plan, began) and time_left() > 0.0
             ended = record.ended(plan.reason) if time_left() > 0.0 else f"the time limit came {doing}"
+            if ended and not compares:
+                return record.result(record.best, record.chosen, ended)
             doing = f"with half of dt = {problem.dt:g} s"
-            half, fails = _halved(problem)
-            if compares and half is None:
-                return record.result(plan, len(record.tried) - 1, "")
-            if half is None or (ended and not compares):
-                return record.result(record.best, record.chosen, ended or fails)
-            problem, start = half, half.simulate(plan.policy_on(substeps=2))
+            try:
+                # Held controls keep their period.
+                hold = problem.hold if problem.hold == 1 else 2 * problem.hold
+                problem = problem.at(dt=0.5 * problem.dt, steps=2 * problem.steps, hold=hold)
+            except VarpinError:
+                if compares:
+                    return record.result(plan, len(record.tried) - 1, "")
+                raise
+            start = problem.simulate(plan.policy)
             finer = record.search(problem, start) if compares else None
             if finer is not None and record.compare(finer, began):
                 return record.result(plan, len(record.tried) - 1, "")
@@ -73,15 +78,6 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
             reason = f"interrupted {doing}"
             best = replace(record.best, status=Status.INTERRUPTED, reason=reason)
             return record.result(best, record.chosen, reason)
-
-
-def _halved(problem: OptimalControlProblem) -> tuple[OptimalControlProblem | None, str]:
-    """The problem with half the step, held controls with their period; or why there is none."""
-    hold = problem.hold if problem.hold == 1 else 2 * problem.hold
-    try:
-        return problem.at(dt=0.5 * problem.dt, steps=2 * problem.steps, hold=hold), ""
-    except VarpinError as error:
-        return None, f"with half of dt = {problem.dt:g} s there is no plan: {error}"
 
 
 class _Record:
@@ -112,6 +108,10 @@ class _Record:
         # Constraints are looked at where parts end.
         first = PARTS if problem.constraints else 2
         found = verify(plan, tolerance=TENTH * self.wish, substeps=first, max_substeps=_FINEST)
+        shares = [
+            own.violation / (10.0 * bound.scale)
+            for own, bound in zip(found.constraints, problem.bound_constraints, strict=True)
+        ]
         row = Refined(
             dt=problem.dt,
             steps=problem.steps,
@@ -122,7 +122,7 @@ class _Record:
             iterations=plan.iterations,
             status=plan.status,
             seconds=time.perf_counter() - began,
-            violation=float(np.max([own.share for own in found.constraints], initial=0.0)),
+            violation=float(np.max(shares, initial=0.0)),
         )
         self.tried.append(row)
         kind, value = 0, row.true_cost
@@ -135,7 +135,11 @@ class _Record:
         rank = kind, value if np.isfinite(value) else np.inf
         if rank < self.rank:
             self.best, self.rank, self.chosen = plan, rank, len(self.tried) - 1
-            self.beyond = _beyond(found) if kind >= 2 else ""
+            self.beyond = ""
+            if kind >= 2 and row.violation > 0.0:
+                worst = found.constraints[int(np.argmax(shares))]
+                size = f"{worst.violation:.2g} {worst.unit} ({worst.where})"
+                self.beyond = f"violates {worst.label} on the continuous system by {size}"
         return kind == 0
 
     def compare(self, finer: Solution, began: float) -> bool:
@@ -181,11 +185,3 @@ class _Record:
             reason += f"the plan of dt = {row.dt:g} s {lost} and {above}"
         logger.log(logging.WARNING if ended else logging.INFO, "%s: %s", plan.problem.scene.robot.name, reason)
         return replace(plan, refinement=Refinement(self.wish, not ended, tuple(self.tried), chosen, reason))
-
-
-def _beyond(found: Verification) -> str:
-    """The constraint that is violated most, by how much and where, in words; empty where all hold."""
-    worst = max(found.constraints, key=lambda own: own.share, default=None)
-    if worst is None or not worst.where:
-        return ""
-    return f"violates {worst.label} on the continuous system by {worst.closed_loop:.2g} {worst.unit} ({worst.where})"

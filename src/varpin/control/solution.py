@@ -16,26 +16,23 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.control.between_nodes import enforced
 from varpin.control.history import Iteration, Refinement, SearchState, Status
-from varpin.control.monte_carlo import MonteCarlo, monte_carlo
+from varpin.control.monte_carlo import MonteCarlo, PolicyPaths
 from varpin.control.multipliers import ConstraintReport, Multipliers, reports
 from varpin.control.noise import left_within_steps
 from varpin.control.problem import OptimalControlProblem, require_problem
 from varpin.control.stages import Feedback, Steps
 from varpin.control.verification import Verification, verify
-from varpin.errors import FileError, InputError
-from varpin.finding import Finding
-from varpin.io.archive import Axes, members_of, read_npz, record_of, write_npz
+from varpin.errors import FileError, InputError, VarpinError
+from varpin.finding import Finding, announce
+from varpin.io.archive import Axes, members_of, read_npz, record_of, save_npz
 from varpin.linearization import velocity_at_nodes
-from varpin.model import Robot
 from varpin.signals.policy import LinearPolicy
 from varpin.support.checks import JointValues, count, flag, path_like, positive, word
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, folded, listed, table, warning_count
-from varpin.trajectory import Trajectory
+from varpin.trajectory import PLAN_FORMAT, Trajectory
 
 logger = logging.getLogger(__name__)
-
-_FORMAT = "varpin.solution/5"
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +168,7 @@ class Solution(Frozen):
         # The numbers of the scene are those of the motion.
         for name, value in self.problem.setting.items():
             members[name if name.startswith("scene.") else f"problem.{name}"] = value
-        return write_npz(path, _FORMAT, members)
+        return save_npz(path, PLAN_FORMAT, members)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], problem: OptimalControlProblem) -> Solution:
@@ -182,7 +179,7 @@ class Solution(Frozen):
                 that do not fit together or are not finite, or is of another problem.
         """
         source = path_like("path", path)
-        members, scene = read_npz(source, _FORMAT), require_problem(problem).scene
+        members, scene = read_npz(source, PLAN_FORMAT), require_problem(problem).scene
         # First the motion, whose masses give a clearer message for another robot.
         motion = replace(Trajectory.of_members(source, members, scene.robot), scene_values=scene.values)
         known = [name for name in members if name.startswith(("problem.", "scene."))]
@@ -190,6 +187,7 @@ class Solution(Frozen):
         if difference := problem.differs(setting):
             raise FileError(f"{source} is of another problem: {difference}")
         sizes = {"decisions": problem.decisions, "controls": scene.controls, "states": 2 * scene.robot.dof}
+        sizes["node_rows"] = sum(item.size for item in problem.bound_constraints)
         plan = record_of(cls, members, source, sizes=sizes, known={"problem": problem, "trajectory": motion})
         if other := problem.mismatch(setting, motion, plan.cost):
             raise FileError(f"{source} is {other}")
@@ -239,10 +237,8 @@ class Solution(Frozen):
         given = u, policy.gains[rows], reference, policy.on
         return self.problem.policy_of(*given, before=before, previous_gains=previous_gains, previous=previous)
 
-    def policy_on(self, x: Literal["momentum", "velocity"] | None = None, substeps: int = 1) -> LinearPolicy:
-        """The policy on (q, p) or on (q, v), by default the integrator's, over ``substeps`` times as many steps.
-
-        A simulation needs no ``substeps``: it derives them from its dt and the policy's period.
+    def policy_on(self, x: Literal["momentum", "velocity"] | None = None) -> LinearPolicy:
+        """The policy on (q, p) or on (q, v), by default the integrator's.
 
         Where x is not that of the problem's integrator, dp = L_vq dq + M dv converts the gains, to first order.
 
@@ -252,7 +248,6 @@ class Solution(Frozen):
         own: Literal["momentum", "velocity"] = "momentum" if self.problem.integrator.variational else "velocity"
         x = own if x is None else x
         word("x", x, ("momentum", "velocity"))
-        parts = count("substeps", substeps, least=1)
         gains, trajectory, hold = self.gains, self.trajectory, self.problem.hold
         rows, n = slice(0, -1, hold), self.problem.scene.robot.dof
         linear, previous_gains = self.problem.linear, self.previous_gains
@@ -271,8 +266,7 @@ class Solution(Frozen):
                 gains = np.concatenate([gains[:, :, :n] + second @ by_q, second @ by_p], axis=2)
         reference = np.hstack([trajectory.q[rows], (trajectory.p if x == "momentum" else trajectory.v)[rows]])
         u, before = (self.controls[1:], self.controls[0]) if linear else (self.controls, self.problem.before)
-        given = u, gains, reference, x
-        return self.problem.policy_of(*given, before=before, previous_gains=previous_gains, substeps=parts)
+        return self.problem.policy_of(u, gains, reference, x, before=before, previous_gains=previous_gains)
 
     def verify(
         self, *, tolerance: float = 1e-10, max_substeps: int = 1024, progress: Callable[[int, int], None] | None = None
@@ -312,7 +306,7 @@ class Solution(Frozen):
 
         Path i draws its noise from the i-th child of ``rng``, so results are the same bytes for any number of workers,
         threads, processes or machines of one kind. Workers return only costs. Noise that only Python evaluates
-        (:class:`varpin.CustomNoise`) is simulated path by path, which is slow, and serially without ``executor``.
+        (:class:`varpin.CustomNoise`) is simulated path by path, which is slow.
 
         Main args:
             paths: Number of paths.
@@ -320,51 +314,34 @@ class Solution(Frozen):
             feedback: False for the controls alone.
 
         Other Args:
-            workers: Number of threads; by default one per core.
+            workers: Number of threads; by default one per core, and one under a ``CustomNoise``.
             executor: Any ``concurrent.futures.Executor`` instead of threads; see :func:`varpin.simulate_ensemble`.
             progress: Called after each chunk of paths with (paths done, paths in all).
 
         Raises:
             InputError: Wrong arguments.
-            VarpinError: Fewer than two paths succeeded, or workers were lost repeatedly.
-            MonteCarloInterrupted: Ctrl-C; holds the result of the paths done. It is a KeyboardInterrupt.
+            ForceError, ConstraintError, NoiseError: A user's function failed in a path, which the error names.
+            VarpinError: Fewer than two paths succeeded, or workers were lost.
+            PathsInterrupted: Ctrl-C; holds the result of the paths done. It is a KeyboardInterrupt.
         """
         policy, gains = self.policy, Feedback(self.gains, self.previous_gains)
         if not flag("feedback", feedback):
             policy, gains = policy.without_feedback(), Feedback(np.zeros(self.gains.shape), None)
-        steps, known = Steps(self.problem, self.trajectory), np.isfinite(self.noise_cost)
-        return monte_carlo(
-            self.problem,
-            policy,
-            self.expected_cost,
-            paths,
-            rng,
-            within=left_within_steps(steps, gains) if known else 0.0,
-            workers=workers,
-            executor=executor,
-            progress=progress,
-        )
-
-
-def solution_trajectory(path: str | os.PathLike[str], robot: Robot | None = None) -> Trajectory:
-    """Read only the motion of a solution, without its problem.
-
-    Raises:
-        FileError: As :meth:`Trajectory.load`.
-    """
-    source = path_like("path", path)
-    return Trajectory.of_members(source, read_npz(source, _FORMAT), robot)
+        paths, known = count("paths", paths, least=2), np.isfinite(self.noise_cost)
+        within = left_within_steps(Steps(self.problem, self.trajectory), gains) if known else 0.0
+        every = PolicyPaths(self.problem, policy, paths, rng, predicted=self.expected_cost, within=within)
+        found = every.result(every.run(executor, workers, progress))
+        if found is None:
+            raise VarpinError(f"fewer than two of {paths} paths got to the end; a smaller dt may help")
+        announce(logger, self.problem.scene.announced, self.problem.dt, found.warnings)
+        return found
 
 
 def _require_rows(source: Path, multipliers: Multipliers, problem: OptimalControlProblem) -> None:
     """Refuse multipliers of another number of rows, or of instants that the problem does not have."""
-    between = multipliers.between
-    last = len(problem.constraints), problem.steps
-    if not ((between.rows >= 0) & (between.rows < last)).all():
+    between, found = multipliers.between, multipliers.values.size
+    if not ((between.rows >= 0) & (between.rows < (len(problem.constraints), problem.steps))).all():
         raise FileError(f"{source}: multipliers.between.rows are not in the problem's steps")
-    every = sum(item.size for item in enforced(problem, between).bound_constraints)
-    at_nodes = sum(item.size for item in problem.bound_constraints)
-    for name, expected in (("values", every), ("backoff", every), ("added", at_nodes)):
-        found = getattr(multipliers, name)
-        if found is not None and found.size != expected:
-            raise FileError(f"{source}: multipliers.{name} has shape ({found.size},), where ({expected},) belongs")
+    expected = sum(item.size for item in enforced(problem, between).bound_constraints)
+    if found != expected:
+        raise FileError(f"{source}: multipliers.values has shape ({found},), where ({expected},) belongs")

@@ -10,6 +10,7 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
+from varpin.control.multipliers import ConstraintReport
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.sizes import NOTABLE
 from varpin.core.arrays import Commands
@@ -18,7 +19,7 @@ from varpin.signals.commands import open_line, open_loop
 from varpin.simulation.choice import STIFF
 from varpin.simulation.record import rollout
 from varpin.simulation.spectrum import rate_at_rest
-from varpin.support.markup import facts, table
+from varpin.support.markup import Printed
 from varpin.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -36,57 +37,12 @@ class Played(NamedTuple):
     """A motion under commands in parts of a plan's steps; all NaN where it diverges."""
 
     cost: float
-    outside: list[Outside]  # by each constraint
+    outside: list[ConstraintReport]
     nodes: Floats  # configurations at the plan's nodes
 
 
-class Outside(NamedTuple):
-    """The worst violation of a constraint by a motion, in the constraint's unit."""
-
-    worst: float = np.nan
-    time: float = np.nan
-    row: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.row} at t = {self.time:.4g} s" if self.worst > 0.0 else ""
-
-
 @dataclass(frozen=True)
-class ViolationOnRobot:
-    """Largest violation of a constraint, in its own unit.
-
-    Attributes:
-        label: The constraint.
-        unit: Unit of the values.
-        planned: In the plan, at the constraint's places.
-        open_loop: On the continuous system under the plan's controls alone, also between nodes; for a goal, at the end.
-            NaN where the motion diverges.
-        closed_loop: The same with feedback.
-        where: The worst row and time with feedback, in words; empty without violation or where the motion diverges.
-        range: The range of the constraint's values, in the same unit; 1 m or rad for frames and clearance.
-    """
-
-    label: str
-    unit: str
-    planned: float
-    open_loop: float
-    closed_loop: float
-    where: str
-    range: float = 1.0
-
-    @property
-    def share(self) -> float:
-        """The violation with feedback, relative to the range."""
-        return self.closed_loop / self.range
-
-    def __str__(self) -> str:
-        ways = [("planned", self.planned), ("controls alone", self.open_loop), ("with feedback", self.closed_loop)]
-        violations = ", ".join(f"{name} {x:.1e}" if np.isfinite(x) else f"{name} runs away" for name, x in ways)
-        return f"{self.label} is violated by [{self.unit}]: {violations}{f' ({self.where})' if self.where else ''}"
-
-
-@dataclass(frozen=True)
-class Verification:
+class Verification(Printed):
     """Comparison of a plan with an accurate integration of the continuous system.
 
     Costs are integrals over the continuous motion, without noise; NaN where that motion diverges.
@@ -103,8 +59,10 @@ class Verification:
             allowed no doubling.
         integrator: The accurate integrator: ``Radau(stages=3)`` where dampers, friction or servos are much faster than
             the plan's step.
-        constraints: Violations of the problem's constraints on the continuous system, without margins, at the nodes of
-            the accurate integration from the plan's first one on. Rate limits of controls apply to decisions.
+        constraints: How well the continuous motion with feedback satisfies each of the problem's constraints, without
+            margins, at the nodes of the accurate integration from the plan's first one on; a goal at the end, and rate
+            limits of controls at decisions. All NaN where the motion diverges.
+        open_loop_constraints: The same under the plan's controls alone.
     """
 
     planned_cost: float
@@ -115,7 +73,8 @@ class Verification:
     substeps: int
     accuracy: float
     integrator: str = str(_USUAL)
-    constraints: tuple[ViolationOnRobot, ...] = ()
+    constraints: tuple[ConstraintReport, ...] = ()
+    open_loop_constraints: tuple[ConstraintReport, ...] = ()
 
     @property
     def violation(self) -> float:
@@ -123,7 +82,7 @@ class Verification:
 
         NaN where that motion diverges.
         """
-        return float(np.max([item.closed_loop for item in self.constraints], initial=0.0))
+        return float(np.max([own.violation for own in self.constraints], initial=0.0))
 
     @property
     def told(self) -> bool:
@@ -155,32 +114,26 @@ class Verification:
             f"plan's are not known to a percent{changed}: give max_substeps of {2 * self.substeps} or more"
         )
 
-    def _rows(self) -> list[tuple[str, str, str, str]]:
-        """The costs, losses and gaps of the plan and of both motions, below their names."""
-        rows = [("", "cost", "loss", "end off by [rad or m]"), ("planned", f"{self.planned_cost:.6e}", "", "")]
+    def __str__(self) -> str:
+        lines = [
+            f"{'':16}{'cost':>14}{'loss':>12}  end off by [rad or m]",
+            f"{'planned':16}{self.planned_cost:14.6e}",
+        ]
         opened = ("controls alone", self.open_loop_cost, self.open_loop_loss, self.open_loop_gap)
         closed = ("with feedback", self.closed_loop_cost, self.closed_loop_loss, self.closed_loop_gap)
         for name, cost, loss, gap in (opened, closed):
-            known = np.isfinite(cost)
-            rows.append((name, f"{cost:.6e}", percent(loss), f"{gap:.2e}") if known else (name, "runs away", "", ""))
-        return rows
-
-    def _notes(self) -> list[str]:
-        """What is below the table."""
+            numbers = f"{cost:14.6e}{percent(loss):>12}  {gap:.2e}" if np.isfinite(cost) else f"{'runs away':>14}"
+            lines.append(f"{name:16}{numbers}")
         good = "all motions run away" if self._diverges else "how good the costs are is not known"
         if np.isfinite(self.accuracy):
             good = f"costs are good to {self.accuracy:.0e} of themselves"
-        how = f"{good} ({self.substeps} substeps a step, {self.integrator})"
-        return [how, self.reading, *map(str, self.constraints)]
-
-    def _repr_html_(self) -> str:
-        head, *rows = self._rows()
-        notes = [("", note) for note in self._notes()]
-        return facts("Verification on the continuous system", notes, table(head, rows))
-
-    def __str__(self) -> str:
-        lines = (f"{name:16}{cost:>14}{loss:>12}  {gap}".rstrip() for name, cost, loss, gap in self._rows())
-        return "\n".join([*lines, *self._notes()])
+        lines += [f"{good} ({self.substeps} substeps a step, {self.integrator})", self.reading]
+        for alone, fed in zip(self.open_loop_constraints, self.constraints, strict=True):
+            ways = ("controls alone", alone.violation), ("with feedback", fed.violation)
+            worst = ", ".join(f"{name} {x:.1e}" if np.isfinite(x) else f"{name} runs away" for name, x in ways)
+            where = f" ({fed.where})" if fed.violation > 0.0 else ""
+            lines.append(f"{fed.label} is violated by [{fed.unit}]: {worst}{where}")
+        return "\n".join(lines)
 
 
 def excess(cost: float, base: float) -> float:
@@ -238,22 +191,12 @@ def verify(
             substeps=parts,
             accuracy=accuracy,
             integrator=str(integrator),
-            constraints=_violations(plan, opened, closed),
+            constraints=tuple(closed.outside),
+            open_loop_constraints=tuple(opened.outside),
         )
         if found.told or not problem.scene.dissipates:
             break
     return found
-
-
-def _violations(plan: Solution, opened: Played, closed: Played) -> tuple[ViolationOnRobot, ...]:
-    problem = plan.problem
-    both = zip(_outside(problem, problem, plan.trajectory), opened.outside, closed.outside, strict=True)
-    return tuple(
-        ViolationOnRobot(
-            problem.label_of(bound.source), bound.unit, own.worst, alone.worst, fed.worst, str(fed), 10.0 * bound.scale
-        )
-        for bound, (own, alone, fed) in zip(problem.bound_constraints, both, strict=True)
-    )
 
 
 def replays(plan: Solution, integrator: Integrator, parts: int) -> tuple[Played, Played]:
@@ -273,24 +216,35 @@ def played(
     """The motion of a problem under commands on ``fine``, the same :meth:`in_parts`."""
     motion, failure = rollout(fine.scene, integrator, fine.q0, fine.v0, commands, fine.dt)
     if failure is not None:
-        return Played(np.nan, [Outside() for _ in fine.bound_constraints], np.full((1, fine.q0.size), np.nan))
+        return Played(np.nan, reports_on(fine, None, problem), np.full((1, fine.q0.size), np.nan))
     cost = float(fine.costs(motion.q, motion.v, fine.control_rows(motion)))
-    return Played(cost, _outside(problem, fine, motion), motion.q[:: fine.steps // problem.steps])
+    return Played(cost, reports_on(fine, motion, problem), motion.q[:: fine.steps // problem.steps])
 
 
-def _outside(problem: OptimalControlProblem, fine: OptimalControlProblem, motion: Trajectory) -> list[Outside]:
-    """The worst violation of each constraint, without margins, by a motion on ``fine``."""
+def reports_on(
+    fine: OptimalControlProblem, motion: Trajectory | None, problem: OptimalControlProblem
+) -> list[ConstraintReport]:
+    """How well a motion on ``fine``, the problem :meth:`in_parts`, satisfies each constraint, without margins.
+
+    All NaN without a motion.
+    """
     found = []
     for whole, bound in zip(problem.bound_constraints, fine.bound_constraints, strict=True):
-        c = bound.value(motion.q, motion.v, fine.control_rows(motion))
-        excess = np.abs(c) if bound.source.equality else np.maximum(c, 0.0)
+        c = np.full(bound.shape, np.nan)
+        if motion is not None:
+            c = bound.value(motion.q, motion.v, fine.control_rows(motion)).copy()
         outside = at_start(problem, whole)
         if outside is not None:
             # A row that is violated at the start cannot hold before the first node.
-            excess[: fine.steps // problem.steps - 1, outside > 0.0] = 0.0
-        sample, row = np.unravel_index(int(np.argmax(excess)), excess.shape)
-        found.append(Outside(float(excess[sample, row]), float(bound.times[sample]), bound.rows[row]))
+            c[: fine.steps // problem.steps - 1, outside > 0.0] = 0.0
+        found.append(report_of(problem, bound, c))
     return found
+
+
+def report_of(problem: OptimalControlProblem, bound: BoundConstraint, c: Floats) -> ConstraintReport:
+    """The report of a constraint with values c (K, rows), without multipliers."""
+    given = problem.label_of(bound.source), bound.rows, bound.unit, bound.times
+    return ConstraintReport(*given, c, np.zeros_like(c), bound.source.equality)
 
 
 def at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats | None:
@@ -306,7 +260,7 @@ def in_parts(plan: Solution, integrator: Integrator, parts: int) -> tuple[Comman
     """Commands in parts of a plan's steps: its controls alone, and with feedback."""
     problem, variational, times = plan.problem, integrator.variational, integrator.stage_times
     alone = open_line(plan.controls, times) if problem.linear else open_loop(plan.controls)
-    m, n = problem.scene.controls, problem.scene.robot.dof
-    fed = plan.policy_on("momentum" if variational else "velocity", parts)
-    closed = fed.commands(problem.steps * parts, m, n, variational=variational, stage_times=times)
+    size = problem.steps * parts, problem.scene.controls, problem.scene.robot.dof
+    fed = plan.policy_on("momentum" if variational else "velocity")
+    closed = fed.commands(*size, variational=variational, dt=problem.dt / parts, stage_times=times)
     return alone._replace(hold=problem.hold * parts), closed

@@ -1,32 +1,42 @@
-"""The work of one worker: the simulation of a chunk of paths, its moments, and a check of one path."""
+"""Many paths of a scene under one signal, in chunks: their simulation, the checks of a few, and what comes of them."""
 
 from __future__ import annotations
 
 import copy
 import dataclasses
 import math
-from collections.abc import Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands
-from varpin.ensemble.record import PathFailure
-from varpin.errors import VarpinError
+from varpin.ensemble.record import Ensemble, PathFailure, PathsInterrupted
+from varpin.errors import InputError, VarpinError, WorkersLost
 from varpin.finding import Finding
 from varpin.integrators import Integrator, Segment
+from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
+from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.scene import Scene
 from varpin.mechanics.wiener import Children
 from varpin.signals.commands import as_moved, lines, rows, with_ends
 from varpin.simulation.check import check
 from varpin.simulation.loop import Gains, unstable_loop
-from varpin.simulation.record import Motions, located
+from varpin.simulation.record import Motions
+from varpin.support.checks import told_motion
+from varpin.support.executors import executing, in_order, take_all
 from varpin.support.frozen import Frozen
 
 # By quantity ("split", "energy", "speed"): its largest value, and the path that has it.
 Extremes = dict[str, tuple[float, int]]
+# What is made of the arrays of C paths (C, ...), NaN after a failure, whose numbers of nodes are (C,).
+Reduction = Callable[[dict[str, Floats], Integers], Any]
 
 # Paths in one call of the core.
 _GROUP = 32
@@ -40,14 +50,6 @@ def without_geometry(scene: Scene) -> Scene:
     bare = copy.copy(scene)
     vars(bare)["robot"] = dataclasses.replace(scene.robot, visuals=None, parts=())
     return bare
-
-
-def chunks(steps: int, paths: int) -> Iterator[tuple[int, int]]:
-    """The first path of each chunk, and one past its last."""
-    steps = max(1, steps)
-    size = min(max(math.ceil(paths / _CHUNKS), _LEAST_STEPS // steps), _MOST_STEPS // steps, _MOST_PATHS)
-    size = max(size, _FEWEST_PATHS) if size <= _GROUP else math.ceil(size / _GROUP) * _GROUP
-    return ((first, min(first + size, paths)) for first in range(0, paths, size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +73,14 @@ class Shared(Frozen):
         """The name of the second half of x."""
         return "p" if self.integrator.variational else "v"
 
+    def chunks(self, paths: int) -> Iterator[tuple[int, int]]:
+        """The first path of each chunk, and one past its last; single paths where Python evaluates the noise."""
+        steps = max(1, self.steps)
+        size = min(max(math.ceil(paths / _CHUNKS), _LEAST_STEPS // steps), _MOST_STEPS // steps, _MOST_PATHS)
+        size = max(size, _FEWEST_PATHS) if size <= _GROUP else math.ceil(size / _GROUP) * _GROUP
+        size = 1 if self.scene.noise.diffusion is None else size
+        return ((first, min(first + size, paths)) for first in range(0, paths, size))
+
     def shape(self, name: str) -> tuple[int, ...]:
         """The shape of an array of one path."""
         m, nodes = self.scene.controls, self.steps + 1
@@ -88,52 +98,14 @@ class Shared(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class Task(Frozen):
-    """A chunk of C paths to simulate, and which results to return."""
+    """A chunk of C paths to simulate, and what to make of them."""
 
     shared: Shared
     first: int  # index of the first path
     q0: Floats  # (C, n) [rad or m]
     v0: Floats  # (C, n) [rad/s or m/s]
-    kept: tuple[str, ...] = ()  # names of the arrays to return
-    moments: bool = True  # whether to return moments
-
-
-@dataclass(frozen=True, eq=False)
-class Moments(Frozen):
-    """Sums over some paths at each of N + 1 nodes."""
-
-    count: Integers  # (N + 1,)
-    mean: Floats  # of x and of the energy (N + 1, 2n + 1)
-    squares: Floats  # sums of products of the deviations of x from its mean (N + 1, 2n, 2n)
-    energy: Floats  # sums of squared deviations of the energy from its mean (N + 1,)
-
-    # Paths that blow up may have squares that are infinite.
-    @classmethod
-    @np.errstate(over="ignore", invalid="ignore")
-    def of(cls, x: Floats, nodes: Integers) -> Moments:
-        """Sums of x and the energy (N + 1, 2n + 1, C), the first ``nodes`` (C,) of each path; x is overwritten."""
-        gone = np.arange(len(x))[:, None] >= nodes
-        count = len(nodes) - gone.sum(axis=1)
-        np.copyto(x, 0.0, where=gone[:, None])
-        mean = x.sum(axis=2) / np.maximum(count, 1)[:, None]
-        x -= mean[:, :, None]
-        np.copyto(x, 0.0, where=gone[:, None])
-        squares = np.einsum("jaP,jbP->jab", x[:, :-1], x[:, :-1])
-        return cls(count, mean, squares, np.einsum("jP,jP->j", x[:, -1], x[:, -1]))
-
-    @np.errstate(over="ignore", invalid="ignore")
-    def merged(self, other: Moments) -> Moments:
-        """Sums over the paths of both (Chan, Golub and LeVeque 1979)."""
-        total = self.count + other.count
-        share = other.count / np.maximum(total, 1)
-        apart = other.mean - self.mean
-        weight, x = self.count * share, apart[:, :-1]
-        return Moments(
-            total,
-            self.mean + apart * share[:, None],
-            self.squares + other.squares + (weight[:, None] * x)[:, :, None] * x[:, None, :],
-            self.energy + other.energy + weight * apart[:, -1] ** 2,
-        )
+    names: tuple[str, ...]  # of the arrays that are needed
+    reduce: Reduction
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,17 +113,16 @@ class Part(Frozen):
     """Results of a chunk of C paths."""
 
     first: int  # index of its first path
-    nodes: Integers  # number of nodes of each path (C,)
+    paths: int  # C
     failures: tuple[PathFailure, ...]
     extremes: Extremes
-    moments: Moments | None
-    stored: dict[str, Floats]  # the arrays that the task asks for (C, ...), NaN after a failure
+    found: Any  # what the task makes of the paths
 
 
 def simulate_paths(task: Task) -> Part:
     """Simulate a chunk in one thread. The bytes of a path do not depend on the chunk that it is in."""
     shared, P = task.shared, len(task.q0)
-    names = dict.fromkeys(["q", shared.second, "energy", *task.kept])
+    names = dict.fromkeys(["q", shared.second, "energy", *task.names])
     arrays = {name: np.full((P, *shared.shape(name)), np.nan) for name in names}
     nodes, split = np.ones(P, dtype=np.int64), np.zeros(P)
     failures = []
@@ -164,18 +135,11 @@ def simulate_paths(task: Task) -> Part:
             split[path] = segment.statistics.substeps.sum() - len(segment.q)
             if segment.failure is not None:
                 failures.append(PathFailure(task.first + path, len(segment.q), segment.failure.reason))
-    q, second, energy = arrays["q"], arrays[shared.second], arrays["energy"]
     extremes = {}
-    for name, values in (("split", split), ("energy", energy), ("speed", np.abs(second))):
+    for name, values in (("split", split), ("energy", arrays["energy"]), ("speed", np.abs(arrays[shared.second]))):
         most = np.fmax.reduce(values.reshape(P, -1), axis=1, initial=-np.inf)
         extremes[name] = float(most.max()), task.first + int(np.argmax(most))
-    moments = None
-    if task.moments:
-        # Statistics run over the paths, which are the last axis.
-        x = np.empty((q.shape[1], 2 * q.shape[2] + 1, P))
-        np.concatenate([part.transpose(1, 2, 0) for part in (q, second, energy[:, :, None])], axis=1, out=x)
-        moments = Moments.of(x, nodes)
-    return Part(task.first, nodes, tuple(failures), extremes, moments, {name: arrays[name] for name in task.kept})
+    return Part(task.first, P, tuple(failures), extremes, task.reduce(arrays, nodes))
 
 
 def _segments(task: Task, group: slice) -> tuple[list[Segment], list[Segment]]:
@@ -188,18 +152,18 @@ def _segments(task: Task, group: slice) -> tuple[list[Segment], list[Segment]]:
     decisions = rows(shared.commands, 0, shared.steps // shared.commands.hold, before)
     try:
         return starts, shared.integrator.rollout(shared.scene, state, decisions, shared.drawn(first, last), shared.dt)
-    except CustomForceError as error:
+    except (CustomForceError, CustomConstraintError, NoiseFieldError) as error:
         raise _located(task, range(first, last), error) from error
 
 
-def _located(task: Task, paths: range, error: CustomForceError) -> VarpinError:
-    """The error of a custom force, with the path and the step where it failed and the motion up to there."""
+def _located(task: Task, paths: range, error: InputError) -> VarpinError:
+    """The error of a user's function, with the path and the step where it failed and the motion up to there."""
     shared = task.shared
     for path in paths:
         start = task.q0[path - task.first], task.v0[path - task.first]
         (drawn,) = shared.drawn(path, path + 1)
-        given = shared.scene, shared.integrator, start, shared.commands, shared.dt, drawn
-        found = located(*given, error, f"path {path}: ")
+        motions = Motions(shared.scene, shared.integrator, *start, shared.dt)
+        found = motions.located(shared.commands, drawn, error, f"path {path}: ")
         if found is not error:
             return found
     return error
@@ -223,14 +187,118 @@ def _store(path: dict[str, Floats], shared: Shared, start: Segment, segment: Seg
                 path[name][: len(values)] = values
 
 
-def examine(task: Task) -> tuple[Finding, ...]:
-    """Findings about one path."""
-    shared = task.shared
-    (drawn,) = shared.drawn(task.first, task.first + 1)
-    motions = Motions(shared.scene, shared.integrator, task.q0[0], task.v0[0], shared.dt)
-    motion, _ = motions.under(shared.commands, increments=drawn)
+def examine(task: tuple[Shared, int, Floats, Floats]) -> tuple[Finding, ...]:
+    """Findings about one path, from its index and its state at the start."""
+    shared, path, q0, v0 = task
+    (drawn,) = shared.drawn(path, path + 1)
+    motion, _ = Motions(shared.scene, shared.integrator, q0, v0, shared.dt).under(shared.commands, increments=drawn)
     # The loop's check is for held controls.
     held = len(shared.commands.gains) and not shared.linear
     gains = Gains(shared.commands.gains, shared.integrator.variational)
     loop = unstable_loop(shared.scene, motion, shared.commands.hold, gains) if held else ()
     return (*loop, *check(shared.scene, shared.integrator, motion, shared.commands if held else None).warnings)
+
+
+class Paths(ABC):
+    """What P paths from (q0, v0) (P, n) have shown so far, in their order."""
+
+    def __init__(self, shared: Shared, q0: Floats, v0: Floats) -> None:
+        self.shared, self.q0, self.v0 = shared, q0, v0
+        self.done = 0
+        self.failures: list[PathFailure] = []
+        self.extremes: Extremes = {}
+
+    @abstractmethod
+    def reduction(self, first: int) -> tuple[tuple[str, ...], Reduction]:
+        """The names of the arrays that the chunk from path ``first`` on needs, and what to make of them."""
+
+    @abstractmethod
+    def take(self, part: Part) -> None:
+        """Take what was made of the next chunk."""
+
+    @abstractmethod
+    def result(self, found: tuple[Finding, ...]) -> Any:
+        """The record of the paths so far, with findings as its warnings; None if they are too few."""
+
+    def part_bytes(self) -> int:
+        """Size of what is made of a chunk [bytes], where it is large."""
+        return 0
+
+    def tasks(self) -> Iterator[Task]:
+        """The chunks."""
+        for first, last in self.shared.chunks(len(self.q0)):
+            start = self.q0[first:last].copy(), self.v0[first:last].copy()
+            yield Task(self.shared, first, *start, *self.reduction(first))
+
+    def add(self, part: Part) -> None:
+        """Add the next chunk. One after a gap, which Ctrl-C may leave, is not added."""
+        if part.first != self.done:
+            return
+        self.take(part)
+        self.failures += part.failures
+        for name, found in part.extremes.items():
+            self.extremes[name] = max(self.extremes.get(name, found), found, key=lambda x: x[0])
+        self.done += part.paths
+
+    def executing(self, executor: Executor | None, workers: int | None) -> AbstractContextManager[Executor]:
+        """The workers; one thread by default for functions in Python, which need not be thread-safe."""
+        python = self.shared.scene.noise.diffusion is None
+        return executing(executor, 1 if python and executor is None and workers is None else workers)
+
+    def simulate(self, pool: Executor, progress: Callable[[int, int], None] | None = None) -> None:
+        """Simulate all paths."""
+        with closing(in_order(pool, simulate_paths, self.tasks(), result_bytes=self.part_bytes())) as parts:
+            take_all(parts, self.add, lambda: None if progress is None else progress(self.done, len(self.q0)))
+
+    def run(
+        self, executor: Executor | None, workers: int | None, progress: Callable[[int, int], None] | None
+    ) -> tuple[Finding, ...]:
+        """Simulate all paths; findings about them.
+
+        Raises:
+            PathsInterrupted, WorkersLost: They hold the :meth:`result` of the paths so far.
+        """
+        told_motion("progress", progress, "paths done, paths in all")
+        with self.executing(executor, workers) as pool:
+            try:
+                self.simulate(pool, progress)
+                return (*self.lost(), *self.findings(pool))
+            except (KeyboardInterrupt, WorkersLost) as stop:
+                found: tuple[Finding, ...] = ()
+                # The workers may have stopped; a second Ctrl-C leaves the examination out.
+                with suppress(KeyboardInterrupt):
+                    found = self.findings(None)
+                kept = self.result((*self.lost(), *found)) if self.done else None
+                if isinstance(stop, WorkersLost):
+                    raise WorkersLost(stop.__cause__, kept if isinstance(kept, Ensemble) else None) from stop.__cause__
+                raise PathsInterrupted(kept, self.done) from None
+
+    def findings(self, pool: Executor | None) -> tuple[Finding, ...]:
+        """Findings about a few paths, each kind once, of the path with the largest value; without a pool here.
+
+        They are the first path, and those with the most split steps, the most energy and the largest speed.
+        """
+        if not (self.shared.steps and self.done):
+            return ()
+        split = [path for amount, path in (self.extremes["split"],) if amount > 0]
+        some = dict.fromkeys([0, *split, self.extremes["energy"][1], self.extremes["speed"][1]])
+        tasks = [(self.shared, path, self.q0[path].copy(), self.v0[path].copy()) for path in some]
+        kept: dict[str, Finding] = {}
+        with closing((examine(task) for task in tasks) if pool is None else in_order(pool, examine, tasks)) as results:
+            for path, findings in zip(some, results, strict=True):
+                for finding in findings:
+                    known = kept.get(finding.kind)
+                    if known is None or (finding.value or 0.0) > (known.value or 0.0):
+                        kept[finding.kind] = finding.about(f"path {path}: ")
+        return tuple(kept.values())
+
+    def lost(self) -> tuple[Finding, ...]:
+        """A finding about failed paths, if there are any."""
+        if not self.failures:
+            return ()
+        return (Finding("failed paths", f"{self.failing()}; they are left out of the statistics from there on"),)
+
+    def failing(self) -> str:
+        """The number of failed paths and the earliest failure, in words."""
+        first = min(self.failures, key=lambda failure: failure.step)
+        return f"{len(self.failures)} of {self.done} paths failed, the first at step {first.step}: {first.reason}"

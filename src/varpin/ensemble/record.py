@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from varpin.finding import Finding
 from varpin.io.archive import Axes, read_npz, record_of, save_npz
 from varpin.support.checks import path_like
 from varpin.support.frozen import Frozen
-from varpin.support.markup import facts, table, warning_count
+from varpin.support.markup import Printed, warning_count
 
 FORMAT = "varpin.ensemble/1"
 
@@ -67,7 +67,7 @@ class PathFailure:
 
 
 @dataclass(frozen=True, eq=False)
-class Ensemble(Frozen):
+class Ensemble(Printed, Frozen):
     """P paths over N steps.
 
     Attributes:
@@ -114,37 +114,28 @@ class Ensemble(Frozen):
         return record_of(cls, read_npz(source, FORMAT), source)
 
     def __repr__(self) -> str:
-        return f"Ensemble({self._size()}{warning_count(self.warnings)})"
-
-    def __str__(self) -> str:
-        return "\n".join([f"Ensemble({self._size()})", *(f"warning: {warning}" for warning in self.warnings)])
-
-    def _repr_html_(self) -> str:
-        moments, half = self.statistics, self.statistics.mean.shape[1] // 2
-        deviation = np.sqrt(np.diagonal(moments.covariance[-1]))
-        rows = [(j, float(moments.mean[-1, j]), float(deviation[j])) for j in range(half)]
-        head = ("coordinate", "mean of q in the end [rad or m]", "standard deviation")
-        energy = f"{moments.energy_mean[-1]:.4g} +- {moments.energy_deviation[-1]:.2g} in the end"
-        warned = [("warning", warning) for warning in self.warnings]
-        return facts("Ensemble", [("of", self._size()), ("energy [J]", energy), *warned], table(head, rows))
-
-    def _size(self) -> str:
         counted = int(self.statistics.count[0])
         kept = "" if self.q is not None else ", not stored"
         lost = f", {len(self.failures)} stopped early" if self.failures else ""
         return (
-            f"{counted} paths{kept} over {len(self.t) - 1} steps, {self.t[-1] - self.t[0]:g} s, {self.integrator}{lost}"
+            f"Ensemble({counted} paths{kept} over {len(self.t) - 1} steps, {self.t[-1] - self.t[0]:g} s, "
+            f"{self.integrator}{lost}{warning_count(self.warnings)})"
         )
 
+    def __str__(self) -> str:
+        own = self.statistics
+        energy = f"energy [J]: {own.energy_mean[-1]:.4g} +- {own.energy_deviation[-1]:.2g} in the end"
+        return "\n".join([repr(self), energy, *(f"warning: {own}" for own in self.warnings)])
 
-class EnsembleInterrupted(KeyboardInterrupt):
-    """Ctrl-C during an ensemble.
+
+class PathsInterrupted(KeyboardInterrupt):
+    """Ctrl-C while paths are simulated.
 
     Attributes:
-        ensemble: The paths that were finished, in order from the first; None if there are none.
+        result: The :class:`Ensemble` of the paths that were finished, in order from the first, or their
+            :class:`MonteCarlo`; None if they are too few.
     """
 
-    def __init__(self, ensemble: Ensemble | None) -> None:
-        self.ensemble = ensemble
-        done = 0 if ensemble is None else int(ensemble.statistics.count[0])
-        super().__init__(f"interrupted after {done} paths" + ("; they are in .ensemble" if done else ""))
+    def __init__(self, result: Any, done: int) -> None:
+        self.result = result
+        super().__init__(f"interrupted after {done} paths" + ("; they are in .result" if result is not None else ""))

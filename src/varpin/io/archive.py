@@ -13,7 +13,6 @@ import io
 import os
 import reprlib
 import secrets
-import socket
 import typing
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -47,12 +46,11 @@ class Axes:
 
 
 def save_npz(path: str | os.PathLike[str], form: str, record: Any) -> Path:
-    """Write a record of the format ``form`` as compressed npz; returns its path."""
-    return write_npz(path, form, members_of(record))
+    """Write a record, or its entries, of the format ``form`` as compressed npz; returns its path.
 
-
-def write_npz(path: str | os.PathLike[str], form: str, members: Mapping[str, Any]) -> Path:
-    """Write arrays of the format ``form``; an existing file is replaced only when the new one is complete."""
+    An existing file is replaced only when the new one is complete.
+    """
+    members = record if isinstance(record, Mapping) else members_of(record)
     with atomic_file(path) as stream:
         np.savez_compressed(stream, **members, format=form)
     return Path(path)
@@ -82,8 +80,8 @@ class Entry:
         return array if dtype is None else array.astype(dtype)
 
 
-def read_npz(source: Path, form: str | None = None) -> dict[str, Entry]:
-    """The headers of the arrays of an npz file, which must be of the format ``form`` if that is given.
+def read_npz(source: Path, *forms: str) -> dict[str, Entry]:
+    """The headers of the arrays of an npz file, which must be of one of the formats ``forms`` if there are any.
 
     Each array is read where it is asked for, so that a wrong shape is found before its data.
     """
@@ -91,15 +89,10 @@ def read_npz(source: Path, form: str | None = None) -> dict[str, Entry]:
         names = [name.removesuffix(".npy") for name in archive.namelist()]
         members = {name: Entry(source, archive, name) for name in names}
     found = str(np.asarray(members.get("format", "")))
-    if form is not None and found != form:
+    if forms and found not in forms:
         what = f"its format is {reprlib.repr(found)}" if found else "it has no format"
-        raise FileError(f"{source} is another kind of file: {what} instead of {form!r}")
+        raise FileError(f"{source} is another kind of file: {what} instead of {' or '.join(map(repr, forms))}")
     return members
-
-
-def read_format(source: Path) -> str:
-    """The format of an npz file; empty if it has none."""
-    return str(np.asarray(read_npz(source).get("format", "")))
 
 
 @contextlib.contextmanager
@@ -274,18 +267,11 @@ def _entries(kind: Any, prefix: str) -> Iterator[tuple[Any, str, Any]]:
 
 @contextlib.contextmanager
 def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A binary stream whose contents replace ``path`` when the block ends without an error, and are deleted otherwise.
-
-    What processes that were killed in such a block have left in the folder is deleted, too.
-    """
+    """A binary stream whose contents replace ``path`` when the block ends, and are deleted on an error."""
     target = writable(path)
-    host = socket.gethostname()
     # Not tempfile, whose files only their owner can read.
-    draft = target.with_name(f".varpin-{host}-{os.getpid()}-{secrets.token_hex(8)}")
+    draft = target.with_name(f".varpin-{secrets.token_hex(8)}")
     try:
-        for left in target.parent.glob(f".varpin-{host}-*-*"):
-            if not _runs(left.name.split("-")[-2]):
-                left.unlink(missing_ok=True)
         with draft.open("xb") as stream:
             yield stream
         draft.replace(target)
@@ -294,14 +280,3 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         if isinstance(error, OSError) and not isinstance(error, FileError):
             raise FileError(f"cannot write {target}: {error.strerror or error}") from None
         raise
-
-
-def _runs(process: str) -> bool:
-    """Whether a process of this machine runs."""
-    try:
-        os.kill(int(process), 0)
-    except ProcessLookupError:
-        return False
-    except (ValueError, OverflowError, OSError):
-        return True
-    return True

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from varpin._version import __version__
 from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import ControlError, InputError, StepError, VarpinError
@@ -172,7 +171,7 @@ def trajectory_of(
         mean, stages, nodes = lines(on, steps.u, integrator.stage_times)
         # A kinematic input's control is where its joint is at the end of the step.
         u, within = with_ends(scene, mean, nodes[1:]), with_ends(scene, stages, nodes[1:])
-    return Trajectory.assembled(
+    return Trajectory(
         t=np.arange(N + 1, dtype=np.float64) * dt,
         q=np.concatenate([first.q, steps.q]),
         v=np.concatenate([first.v, steps.v]),
@@ -191,37 +190,7 @@ def trajectory_of(
         constraint_labels=scene.constraint_labels,
         u_stages=np.zeros((N, 0, scene.controls)) if within is None else within,
         u_nodes=nodes,
-        version=__version__,
-        warnings=(),
-        accuracy=None,
     )
-
-
-def located(
-    scene: Scene,
-    integrator: Integrator,
-    start: tuple[Floats, Floats],
-    commands: Commands,
-    dt: float,
-    increments: Floats | None,
-    error: CustomForceError | CustomConstraintError,
-    where: str = "",
-) -> VarpinError:
-    """The error of a user's function that failed in a motion, with its step and the motion before.
-
-    The motion is repeated step by step from ``start`` (q0, v0) to find the step.
-    """
-    state, (first,) = integrator.start(scene, start[0][None], start[1][None])
-    dw = np.zeros((0, scene.processes)) if increments is None else increments
-    record = MotionRecord(scene, integrator, dt, dw, first, commands if len(commands.stage_times) else None)
-    steps = steps_of(commands)
-    try:
-        while record.steps < steps and record.advance(state, None, commands, 1, steps).failure is None:
-            pass
-    except StepError as found:
-        return type(found)(found.step, found.time, f"{where}{found.problem}", found.trajectory)
-    # The function did not fail this time: its result depends on more than its arguments.
-    return error
 
 
 def next_block(
@@ -264,7 +233,6 @@ class Motions:
 
     def __init__(self, scene: Scene, integrator: Integrator, q0: Floats, v0: Floats, dt: float) -> None:
         self.scene, self.integrator, self.dt = scene, integrator, dt
-        self._start = q0, v0
         self._state, (self._first,) = integrator.start(scene, q0[None], v0[None])
 
     def under(
@@ -285,14 +253,30 @@ class Motions:
         try:
             (segment,) = own.rollout(self.scene, state, commands, drawn, self.dt)
         except (CustomForceError, CustomConstraintError) as error:
-            given = self.scene, self.integrator, self._start, commands, self.dt, increments
-            raise located(*given, error) from error
+            raise self.located(commands, increments, error) from error
         done = len(segment.u)
         dw = None if increments is None else increments[:done]
         within = commands.within[:done] if len(commands.within) else None
         line = commands if len(commands.stage_times) else None
         made = trajectory_of(self.scene, self.integrator, self.dt, self._first, [segment], dw, within, line)
         return made, segment.failure
+
+    def located(self, commands: Commands, increments: Floats | None, error: InputError, where: str = "") -> VarpinError:
+        """The error of a user's function that failed under commands, with its step and the motion before.
+
+        The motion is repeated step by step to find the step.
+        """
+        line = commands if len(commands.stage_times) else None
+        dw = np.zeros((0, self.scene.processes)) if increments is None else increments
+        record = MotionRecord(self.scene, self.integrator, self.dt, dw, self._first, line)
+        state, steps = self.integrator.fork(self._state), steps_of(commands)
+        try:
+            while record.steps < steps and record.advance(state, None, commands, 1, steps).failure is None:
+                pass
+        except StepError as found:
+            return type(found)(found.step, found.time, f"{where}{found.problem}", found.trajectory)
+        # The function did not fail this time: its result depends on more than its arguments.
+        return error
 
 
 def rollout(

@@ -20,6 +20,15 @@ def facts(title: str, rows: Iterable[tuple[str, object]], *parts: str) -> str:
     return f'<div class="varpin"><b>{_text(title)}</b><table>{body}</table>{"".join(parts)}</div>'
 
 
+class Printed:
+    """A result whose text has a name and a value in each line below the first; notebooks show it as a table."""
+
+    def _repr_html_(self) -> str:
+        title, *lines = str(self).splitlines()
+        pairs = (line.partition(": ") for line in lines)
+        return facts(title, [(name, value) if value else ("", name) for name, _, value in pairs])
+
+
 def table(columns: Sequence[str], rows: Iterable[Sequence[object]], strong: Iterable[int] = ()) -> str:
     """The first rows under headings, text to the left, numbers to the right; those in ``strong`` are bold."""
     every, bold = list(rows), set(strong)
