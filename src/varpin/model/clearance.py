@@ -19,7 +19,7 @@ from varpin.model.hull import Hull, hull_around
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
 from varpin.model.meshes import joined, read_mesh, shape_points
 from varpin.model.robot import Robot, readable_geometry
-from varpin.model.tree import frame_index, z_to
+from varpin.model.tree import frame_of, z_to
 from varpin.model.urdf import read_xml
 from varpin.support.checks import finite_array, over_time, path_like, positive, require_function, rotation_matrix
 from varpin.support.frozen import Frozen
@@ -238,7 +238,7 @@ class Clearance(Frozen):
     def _shapes(self) -> pin.GeometryModel:
         """The bodies on the joints of the robot's model, with the pairs."""
         model, shapes = self.robot.model, pin.GeometryModel()
-        frames = [model.frames[frame_index(model, link.name, self.robot.name)] for link in self.links]
+        frames = [frame_of(model, link.name, self.robot.name) for link in self.links]
         frames += [model.frames[0]] * len(self.obstacles)
         for i, (body, frame) in enumerate(zip((*self.links, *self.obstacles), frames, strict=True)):
             place = frame.placement * body.placement
@@ -264,7 +264,7 @@ class Clearance(Frozen):
 
 def _joint(robot: Robot, frame: str) -> int:
     """The joint in the robot's model that moves a frame; 0 if none does."""
-    return int(robot.model.frames[frame_index(robot.model, frame, robot.name)].parentJoint)
+    return int(frame_of(robot.model, frame, robot.name).parentJoint)
 
 
 def clearance(

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError
 from varpin.model.mimic import joint_index
-from varpin.model.tree import frame_index
+from varpin.model.tree import frame_of
 from varpin.model.urdf import Inertial, build_shapes, listed, read_urdf
 from varpin.support.checks import as_floats, finite_array, positive, require_finite
 
@@ -99,7 +99,7 @@ def inertial_numbers(robot: Robot, link: str) -> tuple[int, Floats]:
         UnknownFrame: There is no such link.
         InputError: The link belongs to the base.
     """
-    joint = robot.model.frames[frame_index(robot.model, link, robot.name)].parentJoint
+    joint = frame_of(robot.model, link, robot.name).parentJoint
     if joint == 0:
         raise InputError(f"link {link!r} of robot {robot.name!r} belongs to the base, which does not move")
     return joint, np.array(robot.model.inertias[joint].toDynamicParameters())
@@ -108,7 +108,7 @@ def inertial_numbers(robot: Robot, link: str) -> tuple[int, Floats]:
 def point_mass(robot: Robot, frame: str) -> tuple[int, Floats]:
     """The joint that moves a frame, and the numbers (10,) of :func:`inertial_numbers` of 1 kg at its origin."""
     joint, _ = inertial_numbers(robot, frame)
-    place = robot.model.frames[frame_index(robot.model, frame, robot.name)].placement
+    place = frame_of(robot.model, frame, robot.name).placement
     return joint, np.array(pin.Inertia(1.0, place.translation, np.zeros((3, 3))).toDynamicParameters())
 
 
@@ -168,7 +168,7 @@ class Payload:
 def carry(model: pin.Model, payload: Sequence[Payload], robot: str) -> None:
     """Add payloads to the links of ``model``."""
     for part in payload:
-        frame = model.frames[frame_index(model, part.frame, robot)]
+        frame = frame_of(model, part.frame, robot)
         if frame.parentJoint == 0:
             raise InputError(
                 f"payload of robot {robot!r}: frame {part.frame!r} belongs to the base, which does not move"

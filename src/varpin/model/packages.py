@@ -11,10 +11,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
+from varpin.errors import FileError, RobotError, VarpinError
 from varpin.support.frozen import Frozen
 
 # The first words of a file that Git LFS has not fetched.
-LFS_POINTER = b"version https://git-lfs"
+_LFS_POINTER = b"version https://git-lfs"
 
 # A given folder is a package, or contains packages.
 _MANIFESTS = ("package.xml", "*/package.xml")
@@ -85,19 +86,6 @@ class Packages(Frozen):
         """The path of a file; None if it does not exist."""
         return next((path.absolute() for path in self.candidates(name) if path.is_file()), None)
 
-    def in_other_case(self, name: str) -> Path | None:
-        """A file whose path differs from ``name`` in upper and lower case alone; None if there is none."""
-        for path in map(Path.absolute, self.candidates(name)):
-            found = Path(path.anchor)
-            for part in path.parts[1:]:
-                exact = found / part
-                if not exact.exists() and found.is_dir():
-                    exact = next((own for own in found.iterdir() if own.name.lower() == part.lower()), exact)
-                found = exact
-            if found.is_file():
-                return found
-        return None
-
 
 def _named(manifests: Iterator[Path]) -> Iterator[tuple[str, Path]]:
     """Names and folders of packages."""
@@ -105,3 +93,14 @@ def _named(manifests: Iterator[Path]) -> Iterator[tuple[str, Path]]:
         with contextlib.suppress(ET.ParseError, OSError):
             name = ET.parse(manifest).getroot().findtext("name") or manifest.parent.name
             yield name.strip(), manifest.parent
+
+
+def content(path: Path, unfetched: type[VarpinError] = RobotError) -> bytes:
+    """What is in a file; an error, ``unfetched``, if Git LFS has not fetched it."""
+    try:
+        found = path.read_bytes()
+    except OSError as error:
+        raise FileError(f"cannot read {path}: {error.strerror}") from None
+    if found.startswith(_LFS_POINTER):
+        raise unfetched(f"{path} is a Git LFS pointer, not the file itself: git lfs pull downloads it")
+    return found

@@ -67,7 +67,6 @@ class Robot(Frozen):
         equalities: Equality constraints of an MJCF file; ``Scene(constraints="robot")`` takes them.
         inertials: Inertias of the links of a URDF, which the model merges into bodies.
         remarks: How the source is read where that is not plain, in words.
-        notes: What of the source has no effect on purpose, likewise.
         faults: What its masses lack, likewise.
     """
 
@@ -86,7 +85,6 @@ class Robot(Frozen):
     equalities: tuple[Equality, ...] = field(default=(), repr=False)
     inertials: tuple[Inertial, ...] = field(default=(), repr=False)
     remarks: tuple[str, ...] = field(default=(), repr=False)
-    notes: tuple[str, ...] = field(default=(), repr=False)
     faults: tuple[str, ...] = field(default=(), repr=False)
 
     def __repr__(self) -> str:
@@ -116,11 +114,6 @@ class Robot(Frozen):
         """The robot with its model rebuilt; see :func:`varpin.model.mimic.rebuild`."""
         new = rebuild(self.model, **changes)
         return self.changed(model=new.model, ties=new.ties(self.ties), visuals=new.shapes(self.visuals))
-
-    @property
-    def free_model(self) -> pin.Model:
-        """:attr:`model`: in both, mimic joints are free."""
-        return self.model
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
@@ -424,18 +417,14 @@ def check_inertia(robot: Robot) -> None:
                 "mimic multipliers are beyond the range of floating-point numbers"
             )
         inertia = np.diag(M)
-        faulty = inertia <= 0.0
-        negative = bool((inertia < 0.0).any())
-        if negative:
-            faulty = inertia < 0.0
-        elif not faulty.any():
-            scale = np.sqrt(inertia)
-            values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
-            rounding = robot.dof * np.finfo(float).eps
-            if values[0] > rounding:
-                continue
-            worst, negative = np.abs(vectors[:, 0]), bool(values[0] < -rounding)
-            faulty = worst >= 0.5 * worst.max()
+        scale = np.sqrt(np.where(inertia > 0.0, inertia, 1.0))
+        values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
+        rounding = robot.dof * np.finfo(float).eps
+        if values[0] > rounding:
+            continue
+        negative = bool(values[0] < -rounding)
+        weights = np.abs(vectors[:, values < -rounding if negative else values <= rounding]).max(axis=1)
+        faulty = weights >= 0.5 * weights.max()
         # Beside a link of a billion kg every other inertia is a rounding error.
         heavy = next((text for text in faults(robot.model, ()) if " has a mass of " in text), "")
         raise SingularMassMatrix(

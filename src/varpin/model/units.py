@@ -102,12 +102,11 @@ def odd_sizes(robot: Robot, payload: Iterable[Payload]) -> Iterator[str]:
     if hops[body] > _LONG:
         joints = f"{names[int(tree.parent[body]) + 1]!r} and {names[body + 1]!r}"
         yield f"the link between joints {joints} is {hops[body]:.4g} m long: {IN_MILLIMETRES}"
-    span = max(longest_reach(robot, centers=False), _LEAST)
     mass = sum(own.mass for own in robot.model.inertias) - sum(part.mass for part in carried)
     for part in carried:
-        away = float(np.linalg.norm(part.center))
-        if away > AFAR * span:
-            yield f"the payload has its centre {away:.4g} m from frame {part.frame!r}: {IN_MILLIMETRES}"
+        away = {f"the distance of the payload's centre from frame {part.frame!r}": float(np.linalg.norm(part.center))}
+        if sentence := millimetres_hint(robot, away):
+            yield sentence
         if part.mass > _BURDEN * mass > 0.0:
             heavy = f"the payload at frame {part.frame!r} weighs {part.mass:.4g} kg, and the robot {mass:.3g} kg"
             yield f"{heavy}: it may be in grams, and masses are in kg"
@@ -119,7 +118,7 @@ def millimetres_hint(robot: Robot, lengths: dict[str, float], plausible: float =
     Lengths up to ``plausible`` times the robot's reach do not.
     """
     name, length = max(lengths.items(), key=lambda own: own[1])
-    reach = longest_reach(robot)
+    reach = longest_reach(robot, centers=False)
     if not length > plausible * max(reach, _LEAST):
         return ""
     return f"{name} is {length:.4g} m, and the reach of {robot.name} at most {reach:.3g} m: {IN_MILLIMETRES}"

@@ -14,7 +14,7 @@ from typing import Any
 from xml.parsers import expat
 
 from varpin.errors import InputError, MissingDependency, RobotError
-from varpin.model.packages import LFS_POINTER, Packages
+from varpin.model.packages import Packages, content
 
 logger = logging.getLogger(__name__)
 
@@ -65,8 +65,7 @@ def expand(
     ``strict``, an argument that the file does not use is an error.
     """
     xacro, substitution = _package(path)
-    if path.read_bytes().startswith(LFS_POINTER):
-        raise RobotError(f"{path} is a Git LFS pointer, not the file itself: git lfs pull downloads it")
+    content(path)
     words = {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in arguments.items()}
     given = _Arguments(words)
     notes = io.StringIO()

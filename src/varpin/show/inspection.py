@@ -280,7 +280,7 @@ def inspect_robot(
     links = _links(robot)
     shapes, unread = readable_geometry(robot) if flag("meshes", meshes) else (pin.GeometryModel(), {})
     warnings = [
-        *(*robot.faults, *robot.remarks, *robot.notes, *robot.limit_remarks()),
+        *(*robot.faults, *robot.remarks, *robot.limit_remarks()),
         *one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links, shapes))),
         *_mesh_warnings(robot, shapes),
         *dict.fromkeys(what for _, what in unread.values()),
