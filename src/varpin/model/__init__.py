@@ -3,9 +3,9 @@
 from varpin.model.chain import planar_chain as planar_chain
 from varpin.model.combination import combine as combine
 from varpin.model.inertia import Payload as Payload
+from varpin.model.inertia import check_inertia as check_inertia
 from varpin.model.loading import load_robot as load_robot
 from varpin.model.robot import Robot as Robot
-from varpin.model.robot import check_inertia as check_inertia
 from varpin.model.robot import geometry as geometry
 from varpin.model.robot import readable_geometry as readable_geometry
 from varpin.model.robot import require_robot as require_robot

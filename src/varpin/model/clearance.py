@@ -67,8 +67,8 @@ class Obstacle(Frozen):
     @classmethod
     def capsule(cls, begin: ArrayLike, end: ArrayLike, radius: float, name: str = "capsule") -> Obstacle:
         """The points within ``radius`` [m] of the segment from ``begin`` (3,) to ``end`` (3,) [m]."""
-        first, last = finite_array("capsule begin", begin, (3,)), finite_array("capsule end", end, (3,))
-        return cls(str(name), first, last, positive("capsule radius", radius, "m"), None, np.eye(3))
+        first, last = finite_array(f"{name} begin", begin, (3,)), finite_array(f"{name} end", end, (3,))
+        return cls(str(name), first, last, positive(f"{name} radius", radius, "m"), None, np.eye(3))
 
     @classmethod
     def box(cls, center: ArrayLike, sides: ArrayLike, rotation: ArrayLike | None = None, name: str = "box") -> Obstacle:
@@ -295,17 +295,11 @@ def clearance(
     bodies = []
     for name in names:
         if name in given:
-            begin, end, radius = given[name]
-            shape = (
-                finite_array(f"capsules[{name!r}] begin", begin, (3,)),
-                finite_array(f"capsules[{name!r}] end", end, (3,)),
-                positive(f"capsules[{name!r}] radius", radius, "m"),
-            )
+            bodies.append(replace(Obstacle.capsule(*given[name], f"capsules[{name!r}]"), name=name))
         elif name in fitted:
-            shape = capsule_around(fitted[name])
+            bodies.append(Obstacle(name, *capsule_around(fitted[name]), None, np.eye(3)))
         else:
             raise InputError(f"link {name!r} of robot {robot.name!r} has no shape; give capsules={{{name!r}: ...}}")
-        bodies.append(Obstacle(name, *shape, None, np.eye(3)))
     pairs = _of_links(robot, bodies, joints, _disabled(robot, srdf)) if itself else []
     for k in range(len(obstacles)):
         pairs += [(i, len(bodies) + k) for i, joint in enumerate(joints) if joint]

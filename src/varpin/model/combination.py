@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import chain
 from types import MappingProxyType
 
 import numpy as np
@@ -80,7 +79,6 @@ def combine(
         model,
         ties,
         locked=MappingProxyType({word + name: at for robot, word in pairs for name, at in robot.locked.items()}),
-        package_dirs=tuple(dict.fromkeys(chain.from_iterable(robot.package_dirs for robot in robots))),
         group_states=tuple(
             replace(
                 state, group=word + state.group, positions=tuple((word + joint, at) for joint, at in state.positions)

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError, UnknownJoint
-from varpin.model.inertia import Payload, carry, faults, with_mesh_inertias
+from varpin.model.inertia import Payload, carry, check_inertia, faults, with_mesh_inertias
 from varpin.model.mimic import joint_index
-from varpin.model.robot import Robot, check_inertia, limits_of
+from varpin.model.robot import Robot, limits_of
 from varpin.model.sources import describe
 from varpin.model.tree import is_unbounded, joint_axis
 from varpin.model.units import ADVICE, looks_like_degrees, odd_sizes

@@ -15,15 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats
 from varpin.core.arrays import Tree
-from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint, UnknownPosture
+from varpin.errors import InputError, RobotError, UnknownJoint, UnknownPosture
 from varpin.model.equalities import Equality
-from varpin.model.inertia import faults
 from varpin.model.kinematics import place_on_body
 from varpin.model.meshes import Reader, read_mesh, with_own_meshes
 from varpin.model.mimic import Tie, rebuild
 from varpin.model.mjcf import mjcf_shapes
 from varpin.model.srdf import Posture
-from varpin.model.tree import flatten, mechanism, place_of_frame, to_pinocchio
+from varpin.model.tree import flatten, place_of_frame, to_pinocchio
 from varpin.model.units import NO_LIMIT
 from varpin.model.urdf import Inertial, build_shapes, listed, read_urdf
 from varpin.support import markup
@@ -403,30 +402,3 @@ def _hang(robot: Robot, full: pin.Model, shapes: pin.GeometryModel, prefix: str 
         shape.placement = frame.placement * link.placement.inverse() * shape.placement
         shape.parentJoint = frame.parentJoint
     return shapes
-
-
-def check_inertia(robot: Robot) -> None:
-    """Refuse a robot whose mass matrix is singular at q = 0 or at a few seeded random configurations."""
-    rng, core = np.random.default_rng(0), mechanism(robot.tree)
-    for q in [np.zeros(robot.dof), *rng.uniform(-np.pi, np.pi, (3, robot.dof))]:
-        with np.errstate(all="ignore"):
-            M = core.jet(q, np.zeros(robot.dof))[-1]
-        if not np.isfinite(M).all():
-            raise RobotError(
-                f"the mass matrix of robot {robot.name!r} is not finite: masses, inertias, distances or "
-                "mimic multipliers are beyond the range of floating-point numbers"
-            )
-        inertia = np.diag(M)
-        scale = np.sqrt(np.where(inertia > 0.0, inertia, 1.0))
-        values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
-        rounding = robot.dof * np.finfo(float).eps
-        if values[0] > rounding:
-            continue
-        negative = bool(values[0] < -rounding)
-        weights = np.abs(vectors[:, values < -rounding if negative else values <= rounding]).max(axis=1)
-        faulty = weights >= 0.5 * weights.max()
-        # Beside a link of a billion kg every other inertia is a rounding error.
-        heavy = next((text for text in faults(robot.model, ()) if " has a mass of " in text), "")
-        raise SingularMassMatrix(
-            np.array(robot.joint_names)[faulty].tolist(), negative=negative, cause=heavy, hint="".join(robot.faults[:1])
-        )
