@@ -6,33 +6,81 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
+import scipy
+from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError
-from varpin.model.hull import Hull, hull_around
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
 from varpin.model.meshes import joined, read_mesh, shape_points
 from varpin.model.robot import Robot, readable_geometry
 from varpin.model.tree import frame_of, z_to
 from varpin.model.urdf import read_xml
-from varpin.support.checks import finite_array, over_time, path_like, positive, require_function, rotation_matrix
+from varpin.support.checks import (
+    as_floats,
+    finite_array,
+    over_time,
+    path_like,
+    positive,
+    require_finite,
+    require_function,
+    rotation_matrix,
+)
 from varpin.support.frozen import Frozen
 
 coal = pin.coal
 
+# A hull whose least thickness is below this share of its greatest extent is flat.
+_FLAT = 1e-9
+# coal counts the edges that meet in a vertex with 8 bits.
+_EDGES = 254
 # coal's tolerance; its own of 1e-6 leaves errors of 4e-7 m in distances to some hulls, and of 1e-3 in their direction.
 _TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
+class Hull(Frozen):
+    """A convex polyhedron. Made by :func:`hull_around`."""
+
+    points: Floats  # its vertices (P, 3) [m]
+    faces: NDArray[np.int64]  # indices of the vertices of its triangles (F, 3), anticlockwise from outside
+
+
+def hull_around(name: str, points: ArrayLike) -> Hull:
+    """The convex hull of points (N, 3) [m], N >= 4."""
+    given = as_floats(name, points)
+    if given.ndim != 2 or given.shape[1] != 3 or len(given) < 4:
+        raise InputError(f"{name} must have shape (N, 3) with N >= 4, got {given.shape}")
+    require_finite(name, given)
+    extents = np.linalg.svd(given - given.mean(axis=0), compute_uv=False)
+    flat = InputError(f"{name} lie in a plane, and a hull needs a volume: give points on both sides of it")
+    if extents[2] <= _FLAT * extents[0]:
+        raise flat
+    try:
+        found = scipy.spatial.ConvexHull(given)
+    except scipy.spatial.QhullError:
+        raise flat from None
+    place = np.full(len(given), -1)
+    place[found.vertices] = np.arange(len(found.vertices))
+    corners, faces = given[found.vertices], place[found.simplices]
+    a, b, c = (corners[faces[:, k]] for k in range(3))
+    inward = (np.cross(b - a, c - a) * found.equations[:, :3]).sum(axis=1) < 0.0
+    faces[inward] = faces[inward][:, ::-1]
+    most = int(np.bincount(faces.ravel()).max())
+    if most > _EDGES:
+        raise InputError(f"{name} have a hull with {most} edges at one vertex, more than {_EDGES}: give fewer points")
+    return Hull(corners, faces)
+
+
+@dataclass(frozen=True, eq=False)
 class Obstacle(Frozen):
-    """A body in the world, fixed or moving.
+    """A convex body in the world, fixed or moving: all that is within a radius of the hull of some points.
 
     Made by :meth:`sphere`, :meth:`capsule`, :meth:`box`, :meth:`convex` and :meth:`mesh`.
 
@@ -40,44 +88,39 @@ class Obstacle(Frozen):
 
     Attributes:
         name: Name in messages.
-        begin: One end of its axis (3,) [m]; the centre of a sphere, a box or the box around a hull.
-        end: The other end (3,) [m].
+        points: The points (P, 3) in its own axes [m]: one of a ball, both ends of a capsule, else vertices of the hull.
         radius: Radius [m]; 0 for a box or a hull.
-        sides: Sides of a box (3,) [m], else None.
-        rotation: Axes of a box or a hull in the world (3, 3).
-        hull: A convex hull around its centre and in its axes, else None.
+        position: Origin of its axes in the world (3,) [m].
+        rotation: Its axes in the world (3, 3).
         shift: Displacement (3,) [m] at a time [s]; None if the obstacle is fixed.
     """
 
     name: str
-    begin: Floats
-    end: Floats
-    radius: float
-    sides: Floats | None
-    rotation: Floats
-    hull: Hull | None = None
+    points: Floats
+    radius: float = 0.0
+    position: Floats = field(default_factory=lambda: np.zeros(3))
+    rotation: Floats = field(default_factory=lambda: np.eye(3))
     shift: Callable[[float], ArrayLike] | None = None
 
     @classmethod
     def sphere(cls, center: ArrayLike, radius: float, name: str = "sphere") -> Obstacle:
         """A ball with ``center`` (3,) [m] and ``radius`` [m]."""
-        at = finite_array("sphere center", center, (3,))
-        return cls(str(name), at, at, positive("sphere radius", radius, "m"), None, np.eye(3))
+        at = finite_array(f"{name} center", center, (3,))
+        return cls(str(name), np.zeros((1, 3)), positive(f"{name} radius", radius, "m"), at)
 
     @classmethod
     def capsule(cls, begin: ArrayLike, end: ArrayLike, radius: float, name: str = "capsule") -> Obstacle:
         """The points within ``radius`` [m] of the segment from ``begin`` (3,) to ``end`` (3,) [m]."""
-        first, last = finite_array(f"{name} begin", begin, (3,)), finite_array(f"{name} end", end, (3,))
-        return cls(str(name), first, last, positive(f"{name} radius", radius, "m"), None, np.eye(3))
+        ends = finite_array(f"{name} begin", begin, (3,)), finite_array(f"{name} end", end, (3,))
+        return cls(str(name), np.array(ends), positive(f"{name} radius", radius, "m"))
 
     @classmethod
     def box(cls, center: ArrayLike, sides: ArrayLike, rotation: ArrayLike | None = None, name: str = "box") -> Obstacle:
         """A box with ``sides`` (3,) [m] and ``center`` (3,) [m], turned by a ``rotation`` (3, 3)."""
-        at, size = finite_array("box center", center, (3,)), finite_array("box sides", sides, (3,))
+        size = finite_array(f"{name} sides", sides, (3,))
         if not (size > 0.0).all():
-            raise InputError(f"box sides must be > 0 [m], got {size}")
-        R = np.eye(3) if rotation is None else rotation_matrix("box rotation", rotation)
-        return cls(str(name), at, at, 0.0, size, R)
+            raise InputError(f"{name} sides must be > 0 [m], got {size}")
+        return cls.convex(size * list(product((-0.5, 0.5), repeat=3)), center, rotation, name)
 
     @classmethod
     def convex(
@@ -91,7 +134,9 @@ class Obstacle(Frozen):
 
         The points are in axes with their origin at ``position`` (3,) [m] in the world, turned by a ``rotation`` (3, 3).
         """
-        return cls._placed(hull_around("convex points", points), position, rotation, name)
+        at = finite_array(f"{name} position", position, (3,))
+        R = np.eye(3) if rotation is None else rotation_matrix(f"{name} rotation", rotation)
+        return cls(str(name), hull_around(f"{name} points", points).points, 0.0, at, R)
 
     @classmethod
     def mesh(
@@ -110,34 +155,30 @@ class Obstacle(Frozen):
             FileError: The file is missing or is no mesh that can be read.
         """
         file, factor = path_like("mesh path", path), positive("mesh scale", scale, "1")
-        found = hull_around(f"vertices of the mesh {path}", joined(read_mesh(str(file))).vertices * factor)
-        return cls._placed(found, position, rotation, Path(path).stem if name is None else name)
-
-    @classmethod
-    def _placed(cls, hull: Hull, position: ArrayLike, rotation: ArrayLike | None, name: str) -> Obstacle:
-        at = finite_array(f"{name} position", position, (3,))
-        R = np.eye(3) if rotation is None else rotation_matrix(f"{name} rotation", rotation)
-        middle = 0.5 * (hull.points.min(axis=0) + hull.points.max(axis=0))
-        center = at + R @ middle
-        return cls(str(name), center, center, 0.0, None, R, hull.changed(points=hull.points - middle))
+        points = joined(read_mesh(str(file))).vertices * factor
+        return cls.convex(points, position, rotation, Path(path).stem if name is None else name)
 
     @property
     def shape(self) -> Any:
         """The body for coal."""
-        if self.hull is not None:
-            return self.hull.shape
-        if self.sides is not None:
-            return coal.Box(*map(float, self.sides))
-        length = float(np.linalg.norm(self.end - self.begin))
-        return coal.Capsule(self.radius, length) if length > 0.0 else coal.Sphere(self.radius)
+        length = float(np.linalg.norm(self.points[-1] - self.points[0]))
+        if len(self.points) <= 2:
+            return coal.Capsule(self.radius, length) if length > 0.0 else coal.Sphere(self.radius)
+        hull = hull_around(self.name, self.points)
+        points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+        points.extend(hull.points)
+        triangles.extend(coal.Triangle(*map(int, face)) for face in hull.faces)
+        return coal.Convex(points, triangles)
 
     @property
     def placement(self) -> pin.SE3:
         """Placement of :attr:`shape`, whose z axis is that of a capsule, before the obstacle moves."""
-        way = self.end - self.begin
+        if len(self.points) > 2:
+            return pin.SE3(self.rotation, self.position)
+        way = self.points[-1] - self.points[0]
         length = float(np.linalg.norm(way))
-        rotation = z_to(way / length) if length > 0.0 else self.rotation
-        return pin.SE3(rotation, 0.5 * (self.begin + self.end))
+        middle = 0.5 * (self.points[0] + self.points[-1])
+        return pin.SE3(z_to(way / length) if length > 0.0 else self.rotation, self.position + middle)
 
     def moving(self, shift: Callable[[float], ArrayLike]) -> Obstacle:
         """The obstacle displaced by ``shift(t)`` (3,) [m] from its described position at each time t [s].
@@ -163,13 +204,11 @@ class Obstacle(Frozen):
         return over_time(f"the way of obstacle {self.name!r}", self.shift, times, 3)
 
     def __repr__(self) -> str:
-        kind, given = "capsule", [self.begin.tolist(), self.end.tolist(), self.radius]
-        if self.sides is not None:
-            kind, given = "box", [self.begin.tolist(), self.sides.tolist(), self.rotation.tolist()]
-        elif self.hull is not None:
-            kind, given = "convex", [self.hull.points.tolist(), self.begin.tolist(), self.rotation.tolist()]
-        elif self.begin is self.end:
-            kind, given = "sphere", [self.begin.tolist(), self.radius]
+        kind, given = "convex", [self.points.tolist(), self.position.tolist(), self.rotation.tolist()]
+        if len(self.points) == 1:
+            kind, given = "sphere", [self.position.tolist(), self.radius]
+        elif len(self.points) == 2:
+            kind, given = "capsule", [*self.points.tolist(), self.radius]
         moving = "" if self.shift is None else f".moving({self.shift!r})"
         return f"Obstacle.{kind}({', '.join(map(repr, [*given, self.name]))}){moving}"
 
@@ -194,7 +233,7 @@ class Clearance(Frozen):
     def capsules(self) -> dict[str, tuple[Floats, Floats, float]]:
         """Ends and radius of the capsules of the links that joints move, by name."""
         moving = (link for link in self.links if _joint(self.robot, link.name))
-        return {link.name: (link.begin, link.end, link.radius) for link in moving}
+        return {link.name: (link.points[0], link.points[1], link.radius) for link in moving}
 
     def over(self, times: Floats) -> Clearance:
         """The same with the obstacles at times (K,) [s].
@@ -297,7 +336,7 @@ def clearance(
         if name in given:
             bodies.append(replace(Obstacle.capsule(*given[name], f"capsules[{name!r}]"), name=name))
         elif name in fitted:
-            bodies.append(Obstacle(name, *capsule_around(fitted[name]), None, np.eye(3)))
+            bodies.append(Obstacle.capsule(*capsule_around(fitted[name]), name))
         else:
             raise InputError(f"link {name!r} of robot {robot.name!r} has no shape; give capsules={{{name!r}: ...}}")
     pairs = _of_links(robot, bodies, joints, _disabled(robot, srdf)) if itself else []

@@ -226,12 +226,6 @@ class Robot(Frozen):
         return np.asarray(positions.reshape(*q.shape[:-1], 3), dtype=np.float64)
 
     @property
-    def unbounded(self) -> NDArray[np.bool_]:
-        """Whether each coordinate (n,) is an angle without limits."""
-        lower, upper = self.position_limits
-        return ~self.slides & np.isinf(lower) & np.isinf(upper)
-
-    @property
     def position_limits(self) -> tuple[Floats, Floats]:
         """Lower and upper bounds (n,), (n,) [rad or m]; infinite where there are none.
 
