@@ -13,7 +13,8 @@ from oracles import placements
 from refusals import naming, refused, unnamed
 
 import varpin as vp
-from varpin.model import example_robot_data, geometry
+from varpin.model import geometry
+from varpin.model.names import FIXED_BASE
 
 MOVING = ("revolute", "continuous", "prismatic")
 
@@ -31,7 +32,7 @@ def assert_same_jet(a: vp.LagrangianJet, b: vp.LagrangianJet, keep=slice(None), 
 
 
 def test_only_the_bravo7_is_not_installed():
-    missing = set(example_robot_data.FIXED_BASE) - set(vp.robot_names())
+    missing = set(FIXED_BASE) - set(vp.robot_names())
     assert all(name.startswith("bravo7_") for name in missing)
 
 

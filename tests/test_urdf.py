@@ -18,10 +18,11 @@ from mechanisms import INERTIAL, arm, joint, link, mimic, write_urdf
 from refusals import naming, refused, unnamed
 
 import varpin as vp
-from varpin.model import example_robot_data, geometry, readable_geometry
+from varpin.model import geometry, readable_geometry
+from varpin.model.names import robots_dir
 from varpin.model.urdf import read_urdf
 
-ROBOTS = example_robot_data.robots_dir()
+ROBOTS = robots_dir()
 PUBLISHED = sorted(str(path.relative_to(ROBOTS)) for path in ROBOTS.rglob("*.urdf"))
 BALL = '<visual><geometry><sphere radius="0.1"/></geometry></visual>'
 HEAVY = '<inertial><origin xyz="0.1 0 0.2"/><mass value="5"/></inertial>'

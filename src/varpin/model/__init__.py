@@ -5,13 +5,13 @@ from varpin.model.combination import combine as combine
 from varpin.model.inertia import Payload as Payload
 from varpin.model.inertia import check_inertia as check_inertia
 from varpin.model.loading import load_robot as load_robot
+from varpin.model.names import bundled_robots as bundled_robots
+from varpin.model.names import models_dir as models_dir
+from varpin.model.names import robot_names as robot_names
 from varpin.model.robot import Robot as Robot
 from varpin.model.robot import geometry as geometry
 from varpin.model.robot import readable_geometry as readable_geometry
 from varpin.model.robot import require_robot as require_robot
-from varpin.model.sources import bundled_robots as bundled_robots
-from varpin.model.sources import models_dir as models_dir
-from varpin.model.sources import robot_names as robot_names
 from varpin.model.units import ADVICE as ADVICE
 from varpin.model.units import AFAR as AFAR
 from varpin.model.units import ASIDE as ASIDE

@@ -18,10 +18,10 @@ import tempfile
 import textwrap
 import threading
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from xml.parsers import expat
 
 import numpy as np
@@ -49,14 +49,6 @@ COMMENT = re.compile(rb"<!--.*?-->|(<!\[CDATA\[.*?\]\]>)", re.DOTALL)
 _STDERR = threading.Lock()
 
 
-class Mimic(NamedTuple):
-    """A mimic element: the joint is at ratio * (position of joint ``leader``) + offset."""
-
-    leader: str
-    ratio: float
-    offset: float
-
-
 @dataclass(frozen=True, eq=False)
 class Inertial(Frozen):
     """Mass and inertia of a link, as Pinocchio reads them."""
@@ -74,7 +66,6 @@ class Urdf:
     path: Path
     root: ET.Element = field(repr=False)  # with prefixes of names as written
     model: pin.Model = field(repr=False)  # in which mimic joints are independent
-    mimics: Mapping[str, Mimic]  # by joint
     inertials: tuple[Inertial, ...] = field(repr=False)  # of the links that have one
     faults: tuple[str, ...]  # what Pinocchio leaves out of links and joints, in words
     remarks: tuple[str, ...]  # how the file is read where that is not plain, one sentence a kind
@@ -104,13 +95,7 @@ def read_urdf(path: Path, text: str | None = None) -> Urdf:
     remarks = tuple(_remarks(root))
     model, inertials, complaint = _model(root, path)
     faults = (f"Pinocchio reads links in part: {complaint}",) if complaint else ()
-    # Pinocchio's parser refuses mimic elements without a leader, and numbers that are none.
-    followers = {joint.get("name", ""): joint.findall("mimic")[0] for joint in root.findall("joint[mimic]")}
-    mimics = {
-        name: Mimic(mimic.get("joint", ""), float(mimic.get("multiplier", 1.0)), float(mimic.get("offset", 0.0)))
-        for name, mimic in followers.items()
-    }
-    return Urdf(path, root, model, mimics, inertials, faults, remarks)
+    return Urdf(path, root, model, inertials, faults, remarks)
 
 
 def _model(root: ET.Element, path: Path) -> tuple[pin.Model, tuple[Inertial, ...], str]:
