@@ -12,8 +12,8 @@ import re
 from importlib import metadata
 from pathlib import Path
 
-from varpin.errors import FileError, InputError, MissingDependency, RobotError, RobotNotFound
-from varpin.model.packages import Files
+from varpin.errors import FileError, InputError, RobotError, RobotNotFound
+from varpin.model.packages import Files, optional
 from varpin.model.xacro import plain_name
 from varpin.support.checks import is_file, path_like
 
@@ -155,11 +155,7 @@ def _downloadable() -> tuple[str, ...]:
 
 def _download(name: str) -> Files:
     """The files of a robot of robot_descriptions, from the package's cache or from the network."""
-    try:
-        package = importlib.import_module("robot_descriptions")
-    except ImportError as error:
-        missing = error.name or "robot_descriptions"
-        raise MissingDependency(f"robot {name!r}", [missing], 'pip install "varpin[descriptions]"') from None
+    package = optional("robot_descriptions", f"robot {name!r}", "descriptions")
     try:
         module = importlib.import_module(f"robot_descriptions.{name}")
     except Exception as error:  # Importing the module runs git, which may fail in any way.

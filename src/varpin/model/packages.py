@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 import re
 import xml.etree.ElementTree as ET
@@ -10,8 +11,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
-from varpin.errors import FileError, RobotError, VarpinError
+from varpin.errors import FileError, MissingDependency, RobotError, VarpinError
 from varpin.support.frozen import Frozen
 
 # The first words of a file that Git LFS has not fetched.
@@ -104,3 +106,11 @@ def content(path: Path, unfetched: type[VarpinError] = RobotError) -> bytes:
     if found.startswith(_LFS_POINTER):
         raise unfetched(f"{path} is a Git LFS pointer, not the file itself: git lfs pull downloads it")
     return found
+
+
+def optional(module: str, purpose: str, extra: str) -> Any:
+    """A module of one of varpin's extras; a MissingDependency if it is not installed."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MissingDependency(purpose, [error.name or module], f'pip install "varpin[{extra}]"') from None

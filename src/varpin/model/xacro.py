@@ -9,12 +9,11 @@ import re
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 from xml.parsers import expat
 
-from varpin.errors import InputError, MissingDependency, RobotError
-from varpin.model.packages import Packages, content
+from varpin.errors import InputError, RobotError
+from varpin.model.packages import Packages, content, optional
 
 logger = logging.getLogger(__name__)
 
@@ -64,7 +63,8 @@ def expand(
     ``$(find package)`` is looked up in ``packages``, folders by name, around the file, and in ``package_dirs``. If
     ``strict``, an argument that the file does not use is an error.
     """
-    xacro, substitution = _package(path)
+    substitution = optional("xacro.substitution_args", f"the xacro file {path}", "xacro")
+    xacro = importlib.import_module("xacro")
     content(path)
     words = {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in arguments.items()}
     given = _Arguments(words)
@@ -89,13 +89,6 @@ def expand(
         known = ", ".join(sorted(given.used)) or "none"
         raise InputError(f"{path} has no xacro argument {', '.join(map(repr, unknown))}; it takes: {known}")
     return text
-
-
-def _package(path: Path) -> tuple[ModuleType, Any]:
-    try:
-        return importlib.import_module("xacro"), importlib.import_module("xacro.substitution_args")
-    except ModuleNotFoundError as error:
-        raise MissingDependency(f"the xacro file {path}", [str(error.name)], 'pip install "varpin[xacro]"') from None
 
 
 def _told(error: Exception) -> str:
