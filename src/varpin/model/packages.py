@@ -43,13 +43,17 @@ class Packages(Frozen):
 
     file: Path  # the robot's file
     folders: tuple[str, ...] = ()  # that contain packages, or are packages
+    named: Mapping[str, str] = field(default_factory=dict)  # folders of packages by name
 
     @cached_property
     def places(self) -> tuple[Path, ...]:
-        """Folders that contain packages: the given ones, those around the file, those of a sourced ROS."""
-        ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
-        ament = [folder for folder in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if folder]
-        return tuple(Path(folder) for folder in (*self.folders, *ros, *(f"{folder}/share" for folder in ament)))
+        """Folders that contain packages: the given ones, those around the file, its own, those of a sourced ROS."""
+        ros, ament = (
+            [Path(folder) for folder in os.environ.get(name, "").split(os.pathsep) if folder]
+            for name in ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH")
+        )
+        around = [*(package.parent for package in self.around.values()), self.file.parent]
+        return tuple(dict.fromkeys([*map(Path, self.folders), *around, *ros, *(folder / "share" for folder in ament)]))
 
     @cached_property
     def around(self) -> dict[str, Path]:
@@ -64,8 +68,8 @@ class Packages(Frozen):
 
     def folder(self, name: str) -> Path | None:
         """The folder of a package: one around the file, one of that name, or one whose ``package.xml`` has it."""
-        if name in self.around:
-            return self.around[name]
+        if found := self.named.get(name) or self.around.get(name):
+            return Path(found)
         near = [*(folder for folder in self.file.absolute().parents if folder.name == name)]
         near += [place / name for place in self.places]
         return next((folder.absolute() for folder in near if folder.is_dir()), self.below.get(name))

@@ -57,7 +57,7 @@ class Robot(Frozen):
         urdf: The URDF or xacro file the robot was read from, or None.
         expanded: The URDF text of a xacro file.
         mjcf: The MJCF file the robot was read from, or None.
-        package_dirs: Folders in which meshes are looked up.
+        package_dirs: Folders in which packages are looked up, besides those around the file.
         visuals: Geometry that came with a RobotWrapper, locked like the model, or None.
         group_states: The postures that :meth:`posture` reads.
         parts: The robots of a combined robot, see :func:`combine`; empty for others.

@@ -116,7 +116,7 @@ def _check_model(model: pin.Model, name: str) -> None:
 def _of_files(files: Files, *, tied: bool) -> Robot:
     path, text = files.path, None
     if is_xacro(path):
-        text = expand(path, files.xacro_args, _places(path, files.folders), files.packages)
+        text = expand(Packages(path, files.folders, files.packages), files.xacro_args)
     elif is_mjcf(path):
         model, remarks, equalities = read_mjcf(path)
         loops = tuple((each.a.body, each.b.body) for each in equalities if isinstance(each, Closure))
@@ -130,18 +130,12 @@ def _of_files(files: Files, *, tied: bool) -> Robot:
         ties,
         urdf=path,
         expanded=text,
-        package_dirs=_places(path, files.folders),
+        package_dirs=files.folders,
         loops=urdf.loops,
         inertials=urdf.inertials,
         remarks=(*urdf.remarks, *alone),
         faults=urdf.faults,
     )
-
-
-def _places(path: Path, folders: tuple[str, ...]) -> tuple[str, ...]:
-    """Folders in which the packages of a file are looked up: ``folders``, those of its enclosing packages, its own."""
-    around = (str(package.parent) for package in Packages(path).around.values())
-    return tuple(dict.fromkeys((*folders, *around, str(path.parent))))
 
 
 def _with_srdf(robot: Robot, files: Files) -> Robot:
@@ -152,9 +146,10 @@ def _with_srdf(robot: Robot, files: Files) -> Robot:
     states = robot.group_states
     if path is not None:
         try:
-            # A xacro file need not take all of the robot's arguments.
-            places = _places(path, files.folders)
-            text = expand(path, files.srdf_args, places, files.packages, strict=False) if is_xacro(path) else None
+            text = None
+            if is_xacro(path):
+                # It need not take all of the robot's arguments.
+                text = expand(Packages(path, files.folders, files.packages), files.srdf_args, strict=False)
             states, rotors = read_srdf(path, text)
         except (RobotError, FileError) as error:
             if files.srdf is not None:

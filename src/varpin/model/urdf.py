@@ -154,14 +154,15 @@ def build_shapes(
     text = ET.tostring(root, encoding="unicode")
     with captured_stderr() as complaints:
         try:
-            shapes = pin.buildGeomFromUrdfString(urdf.model, text, pin.GeometryType.VISUAL, None, [*package_dirs])
+            shapes = pin.buildGeomFromUrdfString(urdf.model, text, pin.GeometryType.VISUAL)
         except (ValueError, RuntimeError, IndexError) as error:
             raise RobotError(f"the shapes in {urdf.path} cannot be read: {error}") from None
         lines = complaints()
     if lines:
         logger.warning("%s: shapes are read in part: %s", urdf.path, textwrap.shorten("; ".join(lines), _COMPLAINT))
     packages = Packages(urdf.path, tuple(package_dirs))
-    faults = _missing_meshes(urdf, packages)
+    faults: dict[str, str] = {}
+    missing: dict[str, list[str]] = {}
     for shape in shapes.geometryObjects:
         link, mesh, texture = looks.get(shape.name, ("", None, ""))
         if texture:
@@ -169,35 +170,29 @@ def build_shapes(
             if image is None:
                 logger.warning("%s: texture %r is not there", urdf.path, texture)
             shape.meshTexturePath = "" if image is None else str(image)
-        if mesh is not None and link not in faults:
-            file, words = mesh.get("filename", ""), mesh.get("scale", "1 1 1")
+        if mesh is None:
+            continue
+        file, words = mesh.get("filename", ""), mesh.get("scale", "1 1 1")
+        if path := packages.locate(file):
             scale = [_number(word) for word in words.split()]
             try:
                 if len(scale) != 3 or not all(math.isfinite(number) and number for number in scale):
                     raise FileError(f"mesh {file} has the scale {words!r}: give three numbers other than 0")
-                put_mesh(shape, str(packages.locate(file)), scale, read)
+                put_mesh(shape, str(path), scale, read)
             except FileError as error:
                 faults[link] = f"link {link!r}: {error}"
+        else:
+            missing.setdefault(link, []).append(file)
+    if missing:
+        links = listed((f"link {link!r}: {', '.join(files)}" for link, files in missing.items()), "links")
+        places = ", ".join(map(str, packages.places)) or "no folder"
+        message = f"meshes of {urdf.path} are missing: {links}; looked beside the file and in {places}"
+        faults |= dict.fromkeys(missing, f"{message} (package_dirs=[...] adds)")
     found = pin.GeometryModel()
     for shape in shapes.geometryObjects:
         if shape.name not in looks or looks[shape.name][0] not in faults:
             found.addGeometryObject(shape)
     return found, faults
-
-
-def _missing_meshes(urdf: Urdf, packages: Packages) -> dict[str, str]:
-    """The links whose visual meshes are missing, each with the message about all of them."""
-    missing: dict[str, list[str]] = {}
-    for link in urdf.root.findall("link"):
-        for mesh in link.iterfind("visual/geometry/mesh"):
-            if packages.locate(file := mesh.get("filename", "")) is None:
-                missing.setdefault(link.get("name", ""), []).append(file)
-    if not missing:
-        return {}
-    links = listed((f"link {link!r}: {', '.join(files)}" for link, files in missing.items()), "links")
-    message = f"meshes of {urdf.path} are missing: {links}; "
-    places = ", ".join(map(str, packages.places)) or "no folder"
-    return dict.fromkeys(missing, f"{message}looked beside the file and in {places} (package_dirs=[...] adds)")
 
 
 def read_xml(path: Path, text: str | None = None, kind: str = "") -> ET.Element:

@@ -4,10 +4,9 @@ import contextlib
 import importlib
 import io
 import logging
-import os
 import re
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -50,26 +49,19 @@ def plain_name(path: Path) -> str:
     return Path(path.name.removesuffix(".xacro")).stem if is_xacro(path) else path.stem
 
 
-def expand(
-    path: Path,
-    arguments: Mapping[str, object],
-    package_dirs: Sequence[str] = (),
-    packages: Mapping[str, str] | None = None,
-    *,
-    strict: bool = True,
-) -> str:
-    """The XML to which a xacro file expands, with its arguments by name: strings, numbers or booleans.
+def expand(packages: Packages, arguments: Mapping[str, object], *, strict: bool = True) -> str:
+    """The XML to which the file of ``packages``, a xacro file, expands.
 
-    ``$(find package)`` is looked up in ``packages``, folders by name, around the file, and in ``package_dirs``. If
-    ``strict``, an argument that the file does not use is an error.
+    Its arguments, by name, are strings, numbers or booleans. If ``strict``, one that the file does not use is an error.
     """
+    path = packages.file
     substitution = optional("xacro.substitution_args", f"the xacro file {path}", "xacro")
     xacro = importlib.import_module("xacro")
     content(path)
     words = {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in arguments.items()}
     given = _Arguments(words)
     notes = io.StringIO()
-    with _LOCK, contextlib.redirect_stderr(notes), _finding(substitution, path, package_dirs, packages or {}):
+    with _LOCK, contextlib.redirect_stderr(notes), _finding(substitution, packages):
         try:
             text = str(xacro.process_file(str(path), mappings=given).toxml())
         except Exception as error:  # Expressions in the file may raise anything.
@@ -101,20 +93,17 @@ def _told(error: Exception) -> str:
 
 
 @contextlib.contextmanager
-def _finding(substitution: Any, path: Path, package_dirs: Sequence[str], packages: Mapping[str, str]) -> Iterator[None]:
+def _finding(substitution: Any, packages: Packages) -> Iterator[None]:
     """Make xacro look packages up in the folders around the file first, and by ROS only after them."""
-    known = Packages(path, tuple(package_dirs))
     by_ros: Callable[[str], str] = substitution._eval_find
 
     def find(name: str) -> str:
-        if name in packages:
-            return packages[name]
-        if folder := known.folder(name):
+        if folder := packages.folder(name):
             return str(folder)
         try:
             return by_ros(name)
         except Exception:  # There is no ROS or no such package; the exception depends on the version of ROS.
-            looked = ", ".join(map(os.fspath, package_dirs)) or "no package_dirs"
+            looked = ", ".join(map(str, packages.places))
             raise substitution.SubstitutionException(
                 f"no package {name!r} above the file nor in {looked}; give the folder that holds it as package_dirs"
             ) from None
