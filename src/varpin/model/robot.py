@@ -22,7 +22,7 @@ from varpin.model.meshes import Reader, read_mesh, with_own_meshes
 from varpin.model.mimic import Tie, rebuild
 from varpin.model.mjcf import mjcf_shapes
 from varpin.model.srdf import Posture
-from varpin.model.tree import flatten, place_of_frame, to_pinocchio
+from varpin.model.tree import flatten, place_of_frame
 from varpin.model.units import NO_LIMIT
 from varpin.model.urdf import Inertial, build_shapes, listed, read_urdf
 from varpin.support import markup
@@ -193,7 +193,14 @@ class Robot(Frozen):
             InputError: The last dimension of ``q`` is not n.
         """
         joints = self._rows("q", q)[..., self.tree.coordinate]
-        return to_pinocchio(self.model, joints * self.tree.ratio + self.tree.offset)
+        positions = joints * self.tree.ratio + self.tree.offset
+        found = np.empty((*positions.shape[:-1], self.model.nq))
+        for joint, position in zip(self.model.joints[1:], np.moveaxis(positions, -1, 0), strict=True):
+            # Pinocchio keeps the angle of a continuous joint as its cosine and sine.
+            parts = (position,) if joint.nq == 1 else (np.cos(position), np.sin(position))
+            for k, part in enumerate(parts, joint.idx_q):
+                found[..., k] = part
+        return found
 
     def velocity(self, v: ArrayLike) -> Floats:
         """``v`` (..., n) as velocities (..., model.nv) of ``model``: linear in v; errors as :meth:`configuration`."""

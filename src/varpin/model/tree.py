@@ -129,21 +129,6 @@ def place_of_frame(model: pin.Model, frame: str, robot: str) -> tuple[int, Float
     return joint - 1, turn.T @ R, turn.T @ at
 
 
-def to_pinocchio(model: pin.Model, positions: Floats) -> Floats:
-    """Joint positions (..., k), of the joints that are no mimic joints, as configurations (..., model.nq) of a model.
-
-    The angle of a continuous joint becomes Pinocchio's (cos, sin).
-    """
-    configuration = np.empty((*positions.shape[:-1], model.nq))
-    for k, joint in enumerate(joint for joint in model.joints[1:] if joint.nv):
-        if joint.nq == 2:
-            configuration[..., joint.idx_q] = np.cos(positions[..., k])
-            configuration[..., joint.idx_q + 1] = np.sin(positions[..., k])
-        else:
-            configuration[..., joint.idx_q] = positions[..., k]
-    return configuration
-
-
 def origins(parent: Integers, prismatic: Integers) -> Integers:
     """Whether each body (b,) has only prismatic joints above its own: 1 or 0."""
     turns_above = (ancestors(parent) & (prismatic == 0)).sum(axis=1) - (prismatic == 0)

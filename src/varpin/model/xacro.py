@@ -55,8 +55,8 @@ def expand(packages: Packages, arguments: Mapping[str, object], *, strict: bool 
     Its arguments, by name, are strings, numbers or booleans. If ``strict``, one that the file does not use is an error.
     """
     path = packages.file
-    substitution = optional("xacro.substitution_args", f"the xacro file {path}", "xacro")
-    xacro = importlib.import_module("xacro")
+    xacro = optional("xacro", f"the xacro file {path}", "xacro")
+    substitution = importlib.import_module("xacro.substitution_args")
     content(path)
     words = {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in arguments.items()}
     given = _Arguments(words)
