@@ -215,13 +215,14 @@ def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Inte
     return np.asarray(np.unique(label, return_inverse=True)[1], dtype=np.int64)
 
 
+def path_to(tree: Tree, body: int) -> Integers:
+    """The bodies from the root to a body; none to the world, -1."""
+    return np.flatnonzero(ancestors(tree.parent)[body] if body >= 0 else [])
+
+
 def path_coordinates(tree: Tree, body: int) -> Integers:
     """The coordinates that move a body; empty for the world, -1."""
-    found = []
-    while body >= 0:
-        found.append(int(tree.coordinate[body]))
-        body = int(tree.parent[body])
-    return np.array(found, dtype=np.int64)
+    return tree.coordinate[path_to(tree, body)]
 
 
 def block_ends(group: Integers) -> Integers:

@@ -17,11 +17,10 @@ if TYPE_CHECKING:
 
 # Largest plausible angle [rad]: two turns.
 _TURNS = 4.0 * math.pi
-# Degrees up to this are plausible.
-_DEGREES = 1e6
 ADVICE = "angles are in radians, np.deg2rad makes them of degrees"
 
-# A joint whose limit is larger [rad or m] has none: exporters write 1e9, 1e16 or the largest double.
+# A joint whose limit is larger [rad or m] has none: exporters write 1e9, 1e16 or the largest double. Nobody types
+# larger angles in degrees.
 NO_LIMIT = 1e6
 
 # Largest plausible length in a robot's surroundings, in units of its reach: a larger one looks like millimetres.
@@ -57,8 +56,8 @@ def looks_like_degrees(angle: float) -> bool:
 
 def typed_in_degrees(angles: Floats) -> NDArray[np.bool_]:
     """Whether angles [rad] are larger than two turns and have at most one decimal, as someone types degrees."""
-    tenths = 10.0 * np.clip(angles, -_DEGREES, _DEGREES)
-    return (np.abs(angles) > _TURNS) & (np.abs(angles) < _DEGREES) & (tenths == np.round(tenths))
+    tenths = 10.0 * np.clip(angles, -NO_LIMIT, NO_LIMIT)
+    return (np.abs(angles) > _TURNS) & (np.abs(angles) < NO_LIMIT) & (tenths == np.round(tenths))
 
 
 def degrees_hint(robot: Robot, name: str, values: Floats, *, speed: bool = False) -> str:
