@@ -242,7 +242,8 @@ class Clearance(Frozen):
         the time i mod K.
         """
         bodies = enumerate(self.obstacles, len(self.links))
-        return self.changed(shifts={i: body.shifts(times) for i, body in bodies if body.shift is not None})
+        shifts = {i: body.shifts(times) for i, body in bodies if body.shift is not None}
+        return self.changed(shifts=shifts) if shifts else self
 
     def distances(self, q: Floats) -> Floats:
         """The distance of each pair (N, pairs) [m] at q (N, n); negative where they overlap."""

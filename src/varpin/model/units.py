@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -93,16 +93,16 @@ def longest_reach(robot: Robot, *, slides: bool = True, centers: bool = True) ->
     return float((path + (np.linalg.norm(tree.center, axis=1) if centers else 0.0)).max())
 
 
-def odd_sizes(robot: Robot, payload: Iterable[Payload]) -> Iterator[str]:
+def odd_sizes(robot: Robot, payload: Sequence[Payload]) -> Iterator[str]:
     """Sentences about links and payloads whose sizes look like millimetres or grams."""
     tree, names = robot.tree, robot.model.names
     hops = np.where(tree.parent >= 0, np.linalg.norm(tree.translation, axis=1), 0.0)
-    body, carried = int(np.argmax(hops)), tuple(payload)
+    body = int(np.argmax(hops))
     if hops[body] > _LONG:
         joints = f"{names[int(tree.parent[body]) + 1]!r} and {names[body + 1]!r}"
         yield f"the link between joints {joints} is {hops[body]:.4g} m long: {IN_MILLIMETRES}"
-    mass = sum(own.mass for own in robot.model.inertias) - sum(part.mass for part in carried)
-    for part in carried:
+    mass = sum(own.mass for own in robot.model.inertias) - sum(part.mass for part in payload)
+    for part in payload:
         away = {f"the distance of the payload's centre from frame {part.frame!r}": float(np.linalg.norm(part.center))}
         if sentence := millimetres_hint(robot, away):
             yield sentence
