@@ -269,10 +269,9 @@ class Clearance(Frozen):
 
     @cached_property
     def _frames(self) -> dict[int, FrameKinematics]:
-        """The frames of the links of the pairs that joints move."""
-        used = {i for pair in self.pairs for i in pair if i < len(self.links)}
-        moving = (i for i in used if _joint(self.robot, self.links[i].name))
-        return {i: frame_kinematics(self.robot, self.links[i].name) for i in moving}
+        """The frames of the links that joints move."""
+        moving = ((i, link.name) for i, link in enumerate(self.links) if _joint(self.robot, link.name))
+        return {i: frame_kinematics(self.robot, name) for i, name in moving}
 
     @cached_property
     def _shapes(self) -> pin.GeometryModel:
