@@ -23,8 +23,7 @@ from pathlib import Path
 import numpy as np
 
 import varpin as vp
-from varpin.model import bundled_robots
-from varpin.model.example_robot_data import installed
+from varpin.model import robot_names
 from varpin.study.extremes import Kind, Record
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,7 +41,7 @@ PATIENCE = 1.0
 
 def names() -> list[str]:
     """Every robot that goes by a name, and the random trees."""
-    return [*bundled_robots(), *installed(), *(f"tree{seed}" for seed in range(TREES))]
+    return [*robot_names(), *(f"tree{seed}" for seed in range(TREES))]
 
 
 def robot_of(name: str) -> vp.Robot:

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 import varpin as vp
-from varpin.model.example_robot_data import robots_dir
+from varpin.model.names import robots_dir
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent / "benchmarks"))

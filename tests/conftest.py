@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import varpin as vp
-from varpin.model.example_robot_data import FIXED_BASE
+from varpin.model.names import FIXED_BASE
 
 # example-robot-data 6.0.0 dropped the Bravo 7 that 5.0.0 has.
 ROBOTS = [name for name in FIXED_BASE if not name.startswith("bravo7_")] + ["finger"]

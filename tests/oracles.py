@@ -410,8 +410,8 @@ def clearances(own: vp.KeepClear, q: np.ndarray, t: np.ndarray) -> np.ndarray:
         for k, place in enumerate(placements(own.robot, q, link)):
             a, b = (place.act(np.asarray(point, float)) for point in (begin, end))
             for ball in own.obstacles:
-                assert ball.sides is None
-                at = ball.begin + (0.0 if ball.shift is None else np.array(ball.shift(t[k])))
+                assert len(ball.points) == 1
+                at = ball.position + (0.0 if ball.shift is None else np.array(ball.shift(t[k])))
                 share = np.clip((at - a) @ (b - a) / max((b - a) @ (b - a), 1e-300), 0.0, 1.0)
                 gaps.append((k, np.linalg.norm(a + share * (b - a) - at) - radius - ball.radius))
     return np.array([min(gap for at, gap in gaps if at == k) for k in range(len(q))])

@@ -15,7 +15,7 @@ from scipy.interpolate import pade
 import varpin as vp
 from varpin.integrators import BY_NAME, integrator_of
 from varpin.io.scenefile.kinds import INTEGRATORS
-from varpin.model.example_robot_data import FIXED_BASE
+from varpin.model.names import FIXED_BASE
 
 GRAVITY = 9.81
 ALL = [1, 2, 3, 4, 5, 6]

@@ -193,7 +193,7 @@ def test_scene_files(tmp_path):
         for link in ("forearm_link", "wrist_3_link")
     )
     hull = clear.obstacles[-1]
-    np.testing.assert_allclose(hull.begin + hull.hull.points.max(axis=0), [1.4, 0.3, 0.25])
+    np.testing.assert_allclose(hull.position + hull.points.max(axis=0), [1.4, 0.3, 0.25])
     assert box.limits[0].tolist() == [-1.0, -1.0, 0.0]
     assert (plane.offset, sphere.radius) == (0.05, 0.1)
     assert isinstance(joints, vp.WithinJointLimits)
@@ -582,7 +582,7 @@ def test_eight_points_are_a_box():
         vp.Obstacle.convex([*(CUBE * sides), [0, 0, 0], *(CUBE * sides)], center, TURN).moving(way),
         vp.Obstacle.convex((CUBE * sides) @ TURN.T + center).moving(way),
     ]
-    assert made[0].hull.points.shape == (8, 3)
+    assert made[0].points.shape == (8, 3)
     q = np.random.default_rng(0).normal(size=(40, 6))
     times = np.arange(20.0) / 10.0
     known = measured(box).over(times)

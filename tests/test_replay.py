@@ -77,7 +77,7 @@ def test_page_poses_every_shape_as_pinocchio_does(show, browser, name):
     """Those of the robot, and of its ghost, whose three rows stand at 0, 0.75 and 1.5 s."""
     robot = vp.load_robot(name)
     rng = np.random.default_rng(5)
-    q = rng.uniform(-1.0, 1.0, (4, robot.dof)) * np.where(robot.unbounded, 8.0, 1.0)
+    q = rng.uniform(-1.0, 1.0, (4, robot.dof)) * np.where(np.isinf(robot.position_limits[0]), 8.0, 1.0)
     ghost = rng.uniform(-1.0, 1.0, (3, robot.dof))
     show(robot, q, dt=0.5, marks=vp.Marks(ghost=ghost))
     for seconds, now, then in [

@@ -39,8 +39,8 @@ def _closure(closure: Closure, robot: Robot) -> Constraint | None:
         return None
     if closure.turns:
         return FrameOnFrame(a, b, (there * here.inverse()).homogeneous)
-    if closure.plane is not None:
-        return PointOnLine(_point(closure.a), _point(closure.b), there.rotation @ np.array(closure.plane.normal))
+    if closure.normal is not None:
+        return PointOnLine(_point(closure.a), _point(closure.b), there.rotation @ np.array(closure.normal))
     return PointOnPoint(_point(closure.a), _point(closure.b))
 
 

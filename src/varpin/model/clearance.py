@@ -3,35 +3,84 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
+import scipy
+from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError
-from varpin.model.hull import Hull, hull_around
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
 from varpin.model.meshes import joined, read_mesh, shape_points
 from varpin.model.robot import Robot, readable_geometry
-from varpin.model.tree import place_of_frame, z_to
+from varpin.model.tree import frame_of, z_to
 from varpin.model.urdf import read_xml
-from varpin.support.checks import finite_array, over_time, path_like, positive, require_function, rotation_matrix
+from varpin.support.checks import (
+    as_floats,
+    finite_array,
+    over_time,
+    path_like,
+    positive,
+    require_finite,
+    require_function,
+    rotation_matrix,
+)
 from varpin.support.frozen import Frozen
 
 coal = pin.coal
 
+# A hull whose least thickness is below this share of its greatest extent is flat.
+_FLAT = 1e-9
+# coal counts the edges that meet in a vertex with 8 bits.
+_EDGES = 254
 # coal's tolerance; its own of 1e-6 leaves errors of 4e-7 m in distances to some hulls, and of 1e-3 in their direction.
 _TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
+class Hull(Frozen):
+    """A convex polyhedron. Made by :func:`hull_around`."""
+
+    points: Floats  # its vertices (P, 3) [m]
+    faces: NDArray[np.int64]  # indices of the vertices of its triangles (F, 3), anticlockwise from outside
+
+
+def hull_around(name: str, points: ArrayLike) -> Hull:
+    """The convex hull of points (N, 3) [m], N >= 4."""
+    given = as_floats(name, points)
+    if given.ndim != 2 or given.shape[1] != 3 or len(given) < 4:
+        raise InputError(f"{name} must have shape (N, 3) with N >= 4, got {given.shape}")
+    require_finite(name, given)
+    extents = np.linalg.svd(given - given.mean(axis=0), compute_uv=False)
+    flat = InputError(f"{name} lie in a plane, and a hull needs a volume: give points on both sides of it")
+    if extents[2] <= _FLAT * extents[0]:
+        raise flat
+    try:
+        found = scipy.spatial.ConvexHull(given)
+    except scipy.spatial.QhullError:
+        raise flat from None
+    place = np.full(len(given), -1)
+    place[found.vertices] = np.arange(len(found.vertices))
+    corners, faces = given[found.vertices], place[found.simplices]
+    a, b, c = (corners[faces[:, k]] for k in range(3))
+    inward = (np.cross(b - a, c - a) * found.equations[:, :3]).sum(axis=1) < 0.0
+    faces[inward] = faces[inward][:, ::-1]
+    most = int(np.bincount(faces.ravel()).max())
+    if most > _EDGES:
+        raise InputError(f"{name} have a hull with {most} edges at one vertex, more than {_EDGES}: give fewer points")
+    return Hull(corners, faces)
+
+
+@dataclass(frozen=True, eq=False)
 class Obstacle(Frozen):
-    """A body in the world, fixed or moving.
+    """A convex body in the world, fixed or moving: all that is within a radius of the hull of some points.
 
     Made by :meth:`sphere`, :meth:`capsule`, :meth:`box`, :meth:`convex` and :meth:`mesh`.
 
@@ -39,44 +88,39 @@ class Obstacle(Frozen):
 
     Attributes:
         name: Name in messages.
-        begin: One end of its axis (3,) [m]; the centre of a sphere, a box or the box around a hull.
-        end: The other end (3,) [m].
+        points: The points (P, 3) in its own axes [m]: one of a ball, both ends of a capsule, else vertices of the hull.
         radius: Radius [m]; 0 for a box or a hull.
-        sides: Sides of a box (3,) [m], else None.
-        rotation: Axes of a box or a hull in the world (3, 3).
-        hull: A convex hull around its centre and in its axes, else None.
+        position: Origin of its axes in the world (3,) [m].
+        rotation: Its axes in the world (3, 3).
         shift: Displacement (3,) [m] at a time [s]; None if the obstacle is fixed.
     """
 
     name: str
-    begin: Floats
-    end: Floats
-    radius: float
-    sides: Floats | None
-    rotation: Floats
-    hull: Hull | None = None
+    points: Floats
+    radius: float = 0.0
+    position: Floats = field(default_factory=lambda: np.zeros(3))
+    rotation: Floats = field(default_factory=lambda: np.eye(3))
     shift: Callable[[float], ArrayLike] | None = None
 
     @classmethod
     def sphere(cls, center: ArrayLike, radius: float, name: str = "sphere") -> Obstacle:
         """A ball with ``center`` (3,) [m] and ``radius`` [m]."""
-        at = finite_array("sphere center", center, (3,))
-        return cls(str(name), at, at, positive("sphere radius", radius, "m"), None, np.eye(3))
+        at = finite_array(f"{name} center", center, (3,))
+        return cls(str(name), np.zeros((1, 3)), positive(f"{name} radius", radius, "m"), at)
 
     @classmethod
     def capsule(cls, begin: ArrayLike, end: ArrayLike, radius: float, name: str = "capsule") -> Obstacle:
         """The points within ``radius`` [m] of the segment from ``begin`` (3,) to ``end`` (3,) [m]."""
-        first, last = finite_array("capsule begin", begin, (3,)), finite_array("capsule end", end, (3,))
-        return cls(str(name), first, last, positive("capsule radius", radius, "m"), None, np.eye(3))
+        ends = finite_array(f"{name} begin", begin, (3,)), finite_array(f"{name} end", end, (3,))
+        return cls(str(name), np.array(ends), positive(f"{name} radius", radius, "m"))
 
     @classmethod
     def box(cls, center: ArrayLike, sides: ArrayLike, rotation: ArrayLike | None = None, name: str = "box") -> Obstacle:
         """A box with ``sides`` (3,) [m] and ``center`` (3,) [m], turned by a ``rotation`` (3, 3)."""
-        at, size = finite_array("box center", center, (3,)), finite_array("box sides", sides, (3,))
+        size = finite_array(f"{name} sides", sides, (3,))
         if not (size > 0.0).all():
-            raise InputError(f"box sides must be > 0 [m], got {size}")
-        R = np.eye(3) if rotation is None else rotation_matrix("box rotation", rotation)
-        return cls(str(name), at, at, 0.0, size, R)
+            raise InputError(f"{name} sides must be > 0 [m], got {size}")
+        return cls.convex(size * list(product((-0.5, 0.5), repeat=3)), center, rotation, name)
 
     @classmethod
     def convex(
@@ -90,7 +134,9 @@ class Obstacle(Frozen):
 
         The points are in axes with their origin at ``position`` (3,) [m] in the world, turned by a ``rotation`` (3, 3).
         """
-        return cls._placed(hull_around("convex points", points), position, rotation, name)
+        at = finite_array(f"{name} position", position, (3,))
+        R = np.eye(3) if rotation is None else rotation_matrix(f"{name} rotation", rotation)
+        return cls(str(name), hull_around(f"{name} points", points).points, 0.0, at, R)
 
     @classmethod
     def mesh(
@@ -109,21 +155,30 @@ class Obstacle(Frozen):
             FileError: The file is missing or is no mesh that can be read.
         """
         file, factor = path_like("mesh path", path), positive("mesh scale", scale, "1")
-        found = hull_around(f"vertices of the mesh {path}", joined(read_mesh(str(file))).vertices * factor)
-        return cls._placed(found, position, rotation, Path(path).stem if name is None else name)
-
-    @classmethod
-    def _placed(cls, hull: Hull, position: ArrayLike, rotation: ArrayLike | None, name: str) -> Obstacle:
-        at = finite_array(f"{name} position", position, (3,))
-        R = np.eye(3) if rotation is None else rotation_matrix(f"{name} rotation", rotation)
-        middle = 0.5 * (hull.points.min(axis=0) + hull.points.max(axis=0))
-        center = at + R @ middle
-        return cls(str(name), center, center, 0.0, None, R, hull.changed(points=hull.points - middle))
+        points = joined(read_mesh(str(file))).vertices * factor
+        return cls.convex(points, position, rotation, Path(path).stem if name is None else name)
 
     @property
-    def edged(self) -> bool:
-        """Whether it is a box or a hull."""
-        return self.sides is not None or self.hull is not None
+    def shape(self) -> Any:
+        """The body for coal."""
+        length = float(np.linalg.norm(self.points[-1] - self.points[0]))
+        if len(self.points) <= 2:
+            return coal.Capsule(self.radius, length) if length > 0.0 else coal.Sphere(self.radius)
+        hull = hull_around(self.name, self.points)
+        points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+        points.extend(hull.points)
+        triangles.extend(coal.Triangle(*map(int, face)) for face in hull.faces)
+        return coal.Convex(points, triangles)
+
+    @property
+    def placement(self) -> pin.SE3:
+        """Placement of :attr:`shape`, whose z axis is that of a capsule, before the obstacle moves."""
+        if len(self.points) > 2:
+            return pin.SE3(self.rotation, self.position)
+        way = self.points[-1] - self.points[0]
+        length = float(np.linalg.norm(way))
+        middle = 0.5 * (self.points[0] + self.points[-1])
+        return pin.SE3(z_to(way / length) if length > 0.0 else self.rotation, self.position + middle)
 
     def moving(self, shift: Callable[[float], ArrayLike]) -> Obstacle:
         """The obstacle displaced by ``shift(t)`` (3,) [m] from its described position at each time t [s].
@@ -149,39 +204,36 @@ class Obstacle(Frozen):
         return over_time(f"the way of obstacle {self.name!r}", self.shift, times, 3)
 
     def __repr__(self) -> str:
-        kind, given = "capsule", [self.begin.tolist(), self.end.tolist(), self.radius]
-        if self.sides is not None:
-            kind, given = "box", [self.begin.tolist(), self.sides.tolist(), self.rotation.tolist()]
-        elif self.hull is not None:
-            kind, given = "convex", [self.hull.points.tolist(), self.begin.tolist(), self.rotation.tolist()]
-        elif self.begin is self.end:
-            kind, given = "sphere", [self.begin.tolist(), self.radius]
+        kind, given = "convex", [self.points.tolist(), self.position.tolist(), self.rotation.tolist()]
+        if len(self.points) == 1:
+            kind, given = "sphere", [self.position.tolist(), self.radius]
+        elif len(self.points) == 2:
+            kind, given = "capsule", [*self.points.tolist(), self.radius]
         moving = "" if self.shift is None else f".moving({self.shift!r})"
         return f"Obstacle.{kind}({', '.join(map(repr, [*given, self.name]))}){moving}"
 
 
 @dataclass(frozen=True, eq=False)
-class _Body:
-    """A body in the world or on a link."""
-
-    solid: Obstacle  # or the link's capsule in its own axes, with the link's name
-    kinematics: FrameKinematics | None = None  # of the link; None in the world
-    shifts: Floats = field(default_factory=lambda: np.zeros((1, 3)))  # of the obstacle at the times (K, 3) [m]
-
-
 class Clearance(Frozen):
     """Distances of pairs of bodies, links among them. Made by :func:`clearance`."""
 
-    def __init__(self, bodies: Sequence[_Body], pairs: Sequence[tuple[int, int]]) -> None:
-        self._bodies, self._pairs = tuple(bodies), tuple(pairs)
-        self.names = tuple(f"{bodies[i].solid.name} and {bodies[k].solid.name}" for i, k in pairs)
-        links = [body.solid for body in bodies if body.kinematics]
-        self.capsules = {link.name: (link.begin, link.end, link.radius) for link in links}
+    robot: Robot
+    links: tuple[Obstacle, ...]  # capsules in the axes of the frames whose names they have
+    obstacles: tuple[Obstacle, ...]
+    pairs: tuple[tuple[int, int], ...]  # indices of links and, after them, obstacles
+    shifts: Mapping[int, Floats] = field(default_factory=dict)  # of moving obstacles at the times (K, 3) [m]
 
     @property
-    def moves(self) -> bool:
-        """Whether an obstacle moves."""
-        return any(body.solid.shift is not None for body in self._bodies)
+    def names(self) -> tuple[str, ...]:
+        """The names of both bodies of each pair."""
+        bodies = (*self.links, *self.obstacles)
+        return tuple(f"{bodies[i].name} and {bodies[k].name}" for i, k in self.pairs)
+
+    @property
+    def capsules(self) -> dict[str, tuple[Floats, Floats, float]]:
+        """Ends and radius of the capsules of the links that joints move, by name."""
+        moving = (link for link in self.links if _joint(self.robot, link.name))
+        return {link.name: (link.points[0], link.points[1], link.radius) for link in moving}
 
     def over(self, times: Floats) -> Clearance:
         """The same with the obstacles at times (K,) [s].
@@ -189,117 +241,69 @@ class Clearance(Frozen):
         The N rows of q passed to :meth:`distances` are then at these times: N is a multiple of K, and row i belongs to
         the time i mod K.
         """
-        if not self.moves:
-            return self
-        bodies = [replace(body, shifts=body.solid.shifts(times)) for body in self._bodies]
-        return Clearance(bodies, self._pairs)
+        bodies = enumerate(self.obstacles, len(self.links))
+        shifts = {i: body.shifts(times) for i, body in bodies if body.shift is not None}
+        return self.changed(shifts=shifts) if shifts else self
 
     def distances(self, q: Floats) -> Floats:
         """The distance of each pair (N, pairs) [m] at q (N, n); negative where they overlap."""
-        return self._measured(q)[0]
+        found = [[result.min_distance for result in results] for results in self._results(q)]
+        return np.array(found).reshape(len(q), len(self.pairs))
 
     def slopes(self, q: Floats) -> Floats:
         """Derivatives of the distances in q (N, pairs, n), from the nearest points of each pair."""
-        _, normal, first, second = self._measured(q)
-        N, n = q.shape
-        found = np.zeros((N, len(self._pairs), n))
-        moving = {i for pair in self._pairs for i in pair if self._bodies[i].kinematics is not None}
-        jacobians = {i: self._bodies[i].kinematics.jacobians(q) for i in moving}  # type: ignore[union-attr]
-        for p, pair in enumerate(self._pairs):
-            for i, points, sign in ((pair[0], first[:, p], -1.0), (pair[1], second[:, p], 1.0)):
+        points, normals = np.empty((2, len(q), len(self.pairs), 3))
+        for row, results in enumerate(self._results(q)):
+            for p, result in enumerate(results):
+                points[row, p], normals[row, p] = result.getNearestPoint1(), result.normal
+        found = np.zeros((*points.shape[:2], q.shape[1]))
+        jacobians = {i: frame.jacobians(q) for i, frame in self._frames.items()}
+        for p, pair in enumerate(self.pairs):
+            for i, along in zip(pair, (-normals[:, p], normals[:, p]), strict=True):
                 if i in jacobians:
                     _, origin, J = jacobians[i]
-                    along = sign * normal[:, p]
-                    found[:, p] += np.einsum("Na,Nan->Nn", along, J[:, :3])
-                    found[:, p] += np.einsum("Na,Nan->Nn", np.cross(points - origin, along), J[:, 3:])
+                    # The nearest point of the second body is on the same line.
+                    lever = np.cross(points[:, p] - origin, along)
+                    found[:, p] += np.einsum("Na,Nan->Nn", along, J[:, :3]) + np.einsum("Na,Nan->Nn", lever, J[:, 3:])
         return found
 
-    def _measured(self, q: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Distances (N, pairs), unit vectors from first to second (N, pairs, 3), and the nearest points of both."""
-        N, P = len(q), len(self._pairs)
-        placed = [self._placed(body, np.ascontiguousarray(q)) for body in self._bodies]
-        d, normal = np.empty((N, P)), np.empty((N, P, 3))
-        first, second = np.empty((N, P, 3)), np.empty((N, P, 3))
-        for p, (i, k) in enumerate(self._pairs):
-            one, other = self._bodies[i].solid, self._bodies[k].solid
-            measure = _edged if one.edged or other.edged else _round
-            d[:, p], normal[:, p], first[:, p], second[:, p] = measure(one, other, placed[i], placed[k])
-        return d, normal, first, second
+    @cached_property
+    def _frames(self) -> dict[int, FrameKinematics]:
+        """The frames of the links that joints move."""
+        moving = ((i, link.name) for i, link in enumerate(self.links) if _joint(self.robot, link.name))
+        return {i: frame_kinematics(self.robot, name) for i, name in moving}
 
-    @staticmethod
-    def _placed(body: _Body, q: Floats) -> tuple[Floats, Floats, Floats]:
-        """Ends of the axis (N, 3) and (N, 3), and the axes of a box or a hull (N, 3, 3), in the world."""
-        if body.kinematics is None:
-            way = np.tile(body.shifts, (len(q) // len(body.shifts), 1))
-            ends = (x + way for x in (body.solid.begin, body.solid.end))
-            return *ends, np.broadcast_to(body.solid.rotation, (len(q), 3, 3))  # type: ignore[return-value]
-        R, p = body.kinematics.placements(q)
-        return R @ body.solid.begin + p, R @ body.solid.end + p, R @ body.solid.rotation
+    @cached_property
+    def _shapes(self) -> pin.GeometryModel:
+        """The bodies on the joints of the robot's model, with the pairs."""
+        model, shapes = self.robot.model, pin.GeometryModel()
+        frames = [frame_of(model, link.name, self.robot.name) for link in self.links]
+        frames += [model.frames[0]] * len(self.obstacles)
+        for i, (body, frame) in enumerate(zip((*self.links, *self.obstacles), frames, strict=True)):
+            place = frame.placement * body.placement
+            shapes.addGeometryObject(pin.GeometryObject(str(i), frame.parentJoint, place, body.shape))
+        for pair in self.pairs:
+            shapes.addCollisionPair(pin.CollisionPair(*pair))
+        return shapes
 
-
-_Placed = tuple[Floats, Floats, Floats]
-
-
-def _round(one: Obstacle, other: Obstacle, here: _Placed, there: _Placed) -> tuple[Floats, Floats, Floats, Floats]:
-    """:meth:`Clearance._measured` of one pair of capsules (Ericson, "Real-time collision detection", 5.1.9)."""
-    p1, p2 = here[0], there[0]
-    d1, d2, r = here[1] - p1, there[1] - p2, p1 - p2
-    a, e, b = ((x * y).sum(axis=1) for x, y in ((d1, d1), (d2, d2), (d1, d2)))
-    c, f = (d1 * r).sum(axis=1), (d2 * r).sum(axis=1)
-    safe_a, safe_e = np.where(a > 0.0, a, 1.0), np.where(e > 0.0, e, 1.0)
-    across = a * e - b * b
-    crossing = across > 1e-12 * safe_a * safe_e
-    s = np.where(crossing, np.clip((b * f - c * e) / np.where(crossing, across, 1.0), 0.0, 1.0), 0.5 * (a > 0.0))
-    t = np.where(e > 0.0, (b * s + f) / safe_e, 0.0)
-    clipped = np.clip(t, 0.0, 1.0)
-    # Where an end of the second axis is nearest, or the second axis is a point: the nearest point of the first axis.
-    again = (clipped != t) | (e == 0.0) | ~crossing
-    s = np.where(again & (a > 0.0), np.clip((b * clipped - c) / safe_a, 0.0, 1.0), s)
-    first, second = p1 + s[:, None] * d1, p2 + clipped[:, None] * d2
-    way = second - first
-    length = np.linalg.norm(way, axis=1)
-    # Axes that intersect have no direction of the shortest distance: take z.
-    unit = np.where(length[:, None] > 0.0, way / np.where(length > 0.0, length, 1.0)[:, None], [0.0, 0.0, 1.0])
-    return (
-        length - one.radius - other.radius,
-        unit,
-        first + one.radius * unit,
-        second - other.radius * unit,
-    )
+    def _results(self, q: Floats) -> Iterator[Any]:
+        """What coal finds of each pair, for each row of q; valid until the next row."""
+        model, shapes, request = self.robot.model, self._shapes, coal.DistanceRequest()
+        request.gjk_tolerance = request.epa_tolerance = _TOLERANCE
+        data, at = model.createData(), shapes.createData()
+        for p in range(len(self.pairs)):
+            at.distanceRequests[p] = request
+        for row, configuration in enumerate(self.robot.configuration(q)):
+            pin.updateGeometryPlacements(model, data, shapes, at, configuration)
+            for i, shifts in self.shifts.items():
+                at.oMg[i].translation = at.oMg[i].translation + shifts[row % len(shifts)]
+            pin.computeDistances(shapes, at)
+            yield at.distanceResults
 
 
-def _edged(one: Obstacle, other: Obstacle, here: _Placed, there: _Placed) -> tuple[Floats, Floats, Floats, Floats]:
-    """As :func:`_round`, for two bodies of which at least one is a box or a hull, computed by coal."""
-    N = len(here[0])
-    d, normal, first, second = np.empty(N), np.empty((N, 3)), np.empty((N, 3)), np.empty((N, 3))
-    shapes = [_shape(body) for body in (one, other)]
-    request, result = coal.DistanceRequest(), coal.DistanceResult()
-    request.gjk_tolerance = request.epa_tolerance = _TOLERANCE
-    for k in range(N):
-        places = [_transform(body, at, k) for body, at in ((one, here), (other, there))]
-        result.clear()
-        d[k] = coal.distance(shapes[0], places[0], shapes[1], places[1], request, result)
-        first[k], second[k] = result.getNearestPoint1(), result.getNearestPoint2()
-        normal[k] = result.normal
-    return d, normal, first, second
-
-
-def _shape(body: Obstacle) -> Any:
-    if body.sides is not None:
-        return coal.Box(*map(float, body.sides))
-    if body.hull is not None:
-        return body.hull.shape
-    length = float(np.linalg.norm(body.end - body.begin))
-    return coal.Capsule(body.radius, length) if length > 0.0 else coal.Sphere(body.radius)
-
-
-def _transform(body: Obstacle, at: _Placed, k: int) -> Any:
-    begin, end, R = at[0][k], at[1][k], at[2][k]
-    if not body.edged:
-        way = end - begin
-        length = float(np.linalg.norm(way))
-        R = z_to(way / length) if length > 0.0 else np.eye(3)
-    return coal.Transform3s(np.ascontiguousarray(R), 0.5 * (begin + end))
+def _joint(robot: Robot, frame: str) -> int:
+    """The joint in the robot's model that moves a frame; 0 if none does."""
+    return int(frame_of(robot.model, frame, robot.name).parentJoint)
 
 
 def clearance(
@@ -326,55 +330,39 @@ def clearance(
         raise InputError(f"links has a name twice: {', '.join(map(str, links))}")
     fitted = {} if links is not None and set(links) <= set(given) else _vertices(robot)
     names = list(dict.fromkeys([*fitted, *given])) if links is None else list(links)
+    joints = [_joint(robot, name) for name in names]
     bodies = []
     for name in names:
-        body, _, _ = place_of_frame(robot.model, name, robot.name)
         if name in given:
-            begin, end, radius = given[name]
-            shape = (
-                finite_array(f"capsules[{name!r}] begin", begin, (3,)),
-                finite_array(f"capsules[{name!r}] end", end, (3,)),
-                positive(f"capsules[{name!r}] radius", radius, "m"),
-            )
+            bodies.append(replace(Obstacle.capsule(*given[name], f"capsules[{name!r}]"), name=name))
         elif name in fitted:
-            shape = capsule_around(fitted[name])
+            bodies.append(Obstacle.capsule(*capsule_around(fitted[name]), name))
         else:
             raise InputError(f"link {name!r} of robot {robot.name!r} has no shape; give capsules={{{name!r}: ...}}")
-        # A link that no joint moves is fixed in the world.
-        if body < 0:
-            _, R, p = place_of_frame(robot.model, name, robot.name)
-            shape = R @ shape[0] + p, R @ shape[1] + p, shape[2]
-        solid = Obstacle(name, *shape, None, np.eye(3))
-        bodies.append((body, _Body(solid, None if body < 0 else frame_kinematics(robot, name))))
-    parts = [part for _, part in bodies]
-    moving = [i for i, part in enumerate(parts) if part.kinematics is not None]
-    pairs = _of_links(robot, bodies, _disabled(robot, srdf)) if itself else []
-    for obstacle in obstacles:
-        pairs += [(i, len(parts)) for i in moving]
-        parts.append(_Body(obstacle))
+    pairs = _of_links(robot, bodies, joints, _disabled(robot, srdf)) if itself else []
+    for k in range(len(obstacles)):
+        pairs += [(i, len(bodies) + k) for i, joint in enumerate(joints) if joint]
     if not pairs:
         raise InputError(
             f"robot {robot.name!r} has nothing to keep clear of: give obstacles, or itself=True, and links with shapes "
             "or capsules"
         )
-    return Clearance(parts, pairs)
+    return Clearance(robot, tuple(bodies), tuple(obstacles), tuple(pairs))
 
 
 def _of_links(
-    robot: Robot, bodies: Sequence[tuple[int, _Body]], disabled: set[frozenset[str]]
+    robot: Robot, bodies: Sequence[Obstacle], joints: Sequence[int], disabled: set[frozenset[str]]
 ) -> list[tuple[int, int]]:
     """Pairs of links that are not neighbours."""
-    parent, parts = robot.tree.parent, [part for _, part in bodies]
-    found = []
-    for i, (one, first) in enumerate(bodies):
-        for k, (other, second) in enumerate(bodies[:i]):
-            near = one == other or (one >= 0 and parent[one] == other) or (other >= 0 and parent[other] == one)
-            still = first.kinematics is None and second.kinematics is None
-            if not near and not still and frozenset((first.solid.name, second.solid.name)) not in disabled:
+    parents, found = robot.model.parents, []
+    for i, one in enumerate(joints):
+        for k, other in enumerate(joints[:i]):
+            near = one == other or parents[one] == other or parents[other] == one
+            if not near and frozenset((bodies[i].name, bodies[k].name)) not in disabled:
                 found.append((k, i))
     if not found:
         return []
-    apart = Clearance(parts, found).distances(np.zeros((1, robot.dof)))[0]
+    apart = Clearance(robot, tuple(bodies), (), tuple(found)).distances(np.zeros((1, robot.dof)))[0]
     return [pair for pair, d in zip(found, apart, strict=True) if d > 0.0]
 
 

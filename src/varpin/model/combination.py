@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import chain
 from types import MappingProxyType
 
 import numpy as np
@@ -80,7 +79,6 @@ def combine(
         model,
         ties,
         locked=MappingProxyType({word + name: at for robot, word in pairs for name, at in robot.locked.items()}),
-        package_dirs=tuple(dict.fromkeys(chain.from_iterable(robot.package_dirs for robot in robots))),
         group_states=tuple(
             replace(
                 state, group=word + state.group, positions=tuple((word + joint, at) for joint, at in state.positions)
@@ -111,9 +109,6 @@ def _twice(robots: Sequence[Robot], prefixes: Sequence[str]) -> list[str]:
 
 def _prefixes(robots: Sequence[Robot]) -> tuple[str, ...]:
     """Empty prefixes if names are unique, else the robots' names, or letters."""
-    if not _twice(robots, [""] * len(robots)):
-        return ("",) * len(robots)
-    names = tuple(f"{robot.name}_" for robot in robots)
-    if len(set(names)) == len(names) and not _twice(robots, names):
-        return names
-    return tuple(f"{chr(ord('a') + k)}_" if k < 26 else f"r{k}_" for k in range(len(robots)))
+    letters = tuple(f"{chr(ord('a') + k)}_" if k < 26 else f"r{k}_" for k in range(len(robots)))
+    choices = ("",) * len(robots), tuple(f"{robot.name}_" for robot in robots)
+    return next((prefixes for prefixes in choices if not _twice(robots, prefixes)), letters)

@@ -22,13 +22,6 @@ class End(NamedTuple):
     place: pin.SE3  # placement in the body's axes
 
 
-class Plane(NamedTuple):
-    """The plane of a loop's motion."""
-
-    normal: tuple[float, float, float]  # in the axes of the second frame, b
-    tilt: float  # greatest angle of a joint's axis with the normal, or of a slide's with the plane [rad]
-
-
 class Closure(NamedTuple):
     """Two frames that coincide (``<weld>``), or their origins alone (``<connect>``)."""
 
@@ -36,7 +29,8 @@ class Closure(NamedTuple):
     a: End
     b: End
     turns: bool  # whether the axes of the frames coincide, too
-    plane: Plane | None = None  # of a planar loop whose numbers are rounded; its point coincides in this plane only
+    # In the axes of b, of the plane of a planar loop whose numbers are rounded: the origins coincide in it alone.
+    normal: tuple[float, float, float] | None = None
 
 
 class Gear(NamedTuple):
@@ -51,11 +45,13 @@ class Gear(NamedTuple):
 Equality: TypeAlias = Closure | Gear
 
 
-def rounded_plane(model: pin.Model, a: tuple[int, pin.SE3], b: tuple[int, pin.SE3]) -> Plane | None:
-    """The plane of a loop, if it is planar up to the rounding of a file's numbers; of the model's ``"qpos0"``.
+def rounded_normal(
+    model: pin.Model, a: tuple[int, pin.SE3], b: tuple[int, pin.SE3]
+) -> tuple[float, float, float] | None:
+    """The normal of a loop's plane in the axes of b, if the loop is planar up to the rounding of a file's numbers.
 
     None for loops in space, and for those that are planar to the last digit. The loop is closed at two placements, each
-    in the axes of a joint.
+    in the axes of a joint, and is looked at in the model's ``"qpos0"``.
     """
     sides = [set(model.supports[joint]) for joint, _ in (a, b)]
     loop = sorted(sides[0] ^ sides[1])
@@ -77,7 +73,7 @@ def rounded_plane(model: pin.Model, a: tuple[int, pin.SE3], b: tuple[int, pin.SE
     if tilt > _PARALLEL or off > _PARALLEL * size or (tilt <= _EXACT and off <= _EXACT * size):
         return None
     x, y, z = there.rotation.T @ normal
-    return Plane((float(x), float(y), float(z)), tilt)
+    return float(x), float(y), float(z)
 
 
 def prefixed(equality: Equality, prefix: str) -> Equality:

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
-from varpin.errors import InputError, RobotError
-from varpin.model.mimic import joint_index
-from varpin.model.tree import frame_index
-from varpin.model.urdf import Inertial, build_shapes, listed, read_urdf
+from varpin.errors import InputError, RobotError, SingularMassMatrix
+from varpin.model.robot import Robot, readable_geometry
+from varpin.model.tree import frame_of, mechanism
+from varpin.model.urdf import Inertial, listed
 from varpin.support.checks import as_floats, finite_array, positive, require_finite
-
-if TYPE_CHECKING:
-    from varpin.model.robot import Robot
 
 # Relative tolerance of the triangle inequality. A thin plate satisfies it with equality, and misses it by about this
 # much if its numbers are rounded.
@@ -99,7 +95,7 @@ def inertial_numbers(robot: Robot, link: str) -> tuple[int, Floats]:
         UnknownFrame: There is no such link.
         InputError: The link belongs to the base.
     """
-    joint = robot.model.frames[frame_index(robot.model, link, robot.name)].parentJoint
+    joint = frame_of(robot.model, link, robot.name).parentJoint
     if joint == 0:
         raise InputError(f"link {link!r} of robot {robot.name!r} belongs to the base, which does not move")
     return joint, np.array(robot.model.inertias[joint].toDynamicParameters())
@@ -108,7 +104,7 @@ def inertial_numbers(robot: Robot, link: str) -> tuple[int, Floats]:
 def point_mass(robot: Robot, frame: str) -> tuple[int, Floats]:
     """The joint that moves a frame, and the numbers (10,) of :func:`inertial_numbers` of 1 kg at its origin."""
     joint, _ = inertial_numbers(robot, frame)
-    place = robot.model.frames[frame_index(robot.model, frame, robot.name)].placement
+    place = frame_of(robot.model, frame, robot.name).placement
     return joint, np.array(pin.Inertia(1.0, place.translation, np.zeros((3, 3))).toDynamicParameters())
 
 
@@ -119,6 +115,33 @@ def with_inertial_numbers(robot: Robot, added: Mapping[int, Floats]) -> Robot:
         both = np.array(model.inertias[joint].toDynamicParameters()) + numbers
         model.inertias[joint] = pin.Inertia.FromDynamicParameters(both)
     return robot.changed(model=model, inertials=())
+
+
+def check_inertia(robot: Robot) -> None:
+    """Refuse a robot whose mass matrix is singular at q = 0 or at a few seeded random configurations."""
+    rng, core = np.random.default_rng(0), mechanism(robot.tree)
+    for q in [np.zeros(robot.dof), *rng.uniform(-np.pi, np.pi, (3, robot.dof))]:
+        with np.errstate(all="ignore"):
+            M = core.jet(q, np.zeros(robot.dof))[-1]
+        if not np.isfinite(M).all():
+            raise RobotError(
+                f"the mass matrix of robot {robot.name!r} is not finite: masses, inertias, distances or "
+                "mimic multipliers are beyond the range of floating-point numbers"
+            )
+        inertia = np.diag(M)
+        scale = np.sqrt(np.where(inertia > 0.0, inertia, 1.0))
+        values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
+        rounding = robot.dof * np.finfo(float).eps
+        if values[0] > rounding:
+            continue
+        negative = bool(values[0] < -rounding)
+        weights = np.abs(vectors[:, values < -rounding if negative else values <= rounding]).max(axis=1)
+        faulty = weights >= 0.5 * weights.max()
+        # Beside a link of a billion kg every other inertia is a rounding error.
+        heavy = next((text for text in faults(robot.model, ()) if " has a mass of " in text), "")
+        raise SingularMassMatrix(
+            np.array(robot.joint_names)[faulty].tolist(), negative=negative, cause=heavy, hint="".join(robot.faults[:1])
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +191,7 @@ class Payload:
 def carry(model: pin.Model, payload: Sequence[Payload], robot: str) -> None:
     """Add payloads to the links of ``model``."""
     for part in payload:
-        frame = model.frames[frame_index(model, part.frame, robot)]
+        frame = frame_of(model, part.frame, robot)
         if frame.parentJoint == 0:
             raise InputError(
                 f"payload of robot {robot!r}: frame {part.frame!r} belongs to the base, which does not move"
@@ -194,16 +217,14 @@ def with_mesh_inertias(robot: Robot, density: float) -> Robot:
     density = positive("density", density, "kg/m^3")
     if robot.urdf is None:
         raise InputError(f"inertia='meshes' needs a URDF file; {robot.name!r} does not come from one")
-    urdf = read_urdf(robot.urdf, robot.expanded)
     known = {inertial.link for inertial in robot.inertials}
-    shapes, unread = build_shapes(urdf, robot.package_dirs)
-    for link, what in unread.items():
+    shapes, unread = readable_geometry(robot)
+    for link, (_, what) in unread.items():
         if link not in known:
             raise RobotError(what)
-    model, index = robot.model.copy(), joint_index(robot.model)
-    masses: dict[str, float] = {}
+    model, masses = robot.model.copy(), dict[str, float]()
     for shape in shapes.geometryObjects:
-        link = urdf.model.frames[shape.parentFrame].name
+        link = model.frames[shape.parentFrame].name
         if link in known:
             continue
         volume = float(shape.geometry.computeVolume())
@@ -215,7 +236,7 @@ def with_mesh_inertias(robot: Robot, density: float) -> Robot:
         center = np.asarray(shape.geometry.computeCOM(), dtype=float).reshape(3)
         moments = np.asarray(shape.geometry.computeMomentofInertiaRelatedToCOM(), dtype=float)
         body = pin.Inertia(density * volume, center, 0.5 * density * (moments + moments.T))
-        model.appendBodyToJoint(index.get(urdf.model.names[shape.parentJoint], 0), body, shape.placement)
+        model.appendBodyToJoint(shape.parentJoint, body, shape.placement)
         masses[link] = masses.get(link, 0.0) + density * volume
     weighed = listed((f"{link!r} {mass:.3g} kg" for link, mass in masses.items()), "links")
     remark = f"links without an inertia have that of their shapes at {density:g} kg/m^3: {weighed}"

@@ -12,7 +12,7 @@ from varpin.arrays import Floats
 from varpin.core import Links as Core
 from varpin.core.arrays import Tree
 from varpin.errors import InputError
-from varpin.model.tree import place_of_frame
+from varpin.model.tree import path_to, place_of_frame
 from varpin.support.frozen import Frozen
 
 if TYPE_CHECKING:
@@ -44,10 +44,8 @@ def links(tree: Tree, body: int | None = None) -> Links:
     """The bodies from the root to ``body``, or all bodies if left out."""
     if body is None:
         return Links(tree)
-    path = [body]
-    while tree.parent[path[-1]] >= 0:
-        path.append(int(tree.parent[path[-1]]))
-    own = {name: getattr(tree, name)[path[::-1]] for name in _BODY[1:]}
+    path = path_to(tree, body)
+    own = {name: getattr(tree, name)[path] for name in _BODY[1:]}
     return Links(tree._replace(parent=np.arange(-1, len(path) - 1), **own))
 
 

@@ -14,17 +14,16 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError, UnknownJoint
-from varpin.model.inertia import Payload, carry, faults, with_mesh_inertias
+from varpin.model.inertia import Payload, carry, check_inertia, faults, with_mesh_inertias
 from varpin.model.mimic import joint_index
-from varpin.model.robot import Robot, check_inertia, limits_of
+from varpin.model.robot import Robot, limits_of
 from varpin.model.sources import describe
 from varpin.model.tree import is_unbounded, joint_axis
 from varpin.model.units import ADVICE, looks_like_degrees, odd_sizes
 from varpin.support.checks import (
     JointValues,
     as_floats,
-    broadcast_array,
-    finite,
+    joint_array,
     require_finite,
     rotation_matrix,
     tuple_of,
@@ -104,8 +103,6 @@ def load_robot(
         SingularMassMatrix: A joint moves no inertia, or a negative one.
     """
     robot = unchecked_robot(**locals())
-    for note in robot.notes:
-        logger.info("robot %r: %s", robot.name, note)
     wrong = (*robot.faults, *faults(robot.model, robot.inertials))
     for remark in (*robot.remarks, *wrong, *robot.limit_remarks()):
         logger.warning("robot %r: %s", robot.name, remark)
@@ -171,20 +168,13 @@ def transform(base: ArrayLike | pin.SE3, what: str, otherwise: str = "") -> pin.
 def _with_rotors(robot: Robot, armature: JointValues) -> Robot:
     """The robot with another armature of its coordinates, a number, (n,) or by joint name; locked joints have none."""
     model, names = robot.model, robot.joint_names
-    indices = [model.joints[model.getJointId(name)].idx_v for name in names]
-    armatures = np.array(model.armature)[indices]
-    if not isinstance(armature, Mapping):
-        armature = dict(zip(names, broadcast_array("armature", armature, len(names)), strict=True))
-    for name, number in armature.items():
-        value = finite(f"armature[{name!r}]", number)
-        if value < 0.0:
-            raise InputError(f"armature of joint {name!r} must be >= 0 [kg m^2 or kg], got {value:g}")
-        if name in names:
-            armatures[names.index(name)] = value
-        elif name not in robot.locked:
-            raise UnknownJoint(str(name), names, "armature: the robot has no joint")
-    values = np.array(model.armature)
-    values[indices] = armatures
+    values, indices = np.array(model.armature), [model.joints[model.getJointId(name)].idx_v for name in names]
+    if isinstance(armature, Mapping):
+        given = {name: value for name, value in armature.items() if name not in robot.locked}
+        armature = dict(zip(names, values[indices].tolist(), strict=True)) | given
+    values[indices] = joint_array("armature", armature, names, uniform=True)
+    if (values < 0.0).any():
+        raise InputError(f"armature must be >= 0 [kg m^2 or kg], got {values[indices]}")
     model.armature = values
     return robot.changed(model=model)
 

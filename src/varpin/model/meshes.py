@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats
 from varpin.errors import FileError
-from varpin.model.packages import LFS_POINTER
+from varpin.model.packages import content
 from varpin.support.checks import is_file
 
 logger = logging.getLogger(__name__)
@@ -86,10 +86,7 @@ def read_mesh(path: str) -> tuple[MeshPart, ...]:
     if read is None:
         raise FileError(f"the mesh {path} is of a kind that is not read: convert it to one of {', '.join(_READERS)}")
     try:
-        content = file.read_bytes()
-        if content.startswith(LFS_POINTER):
-            raise FileError(f"the mesh {path} is a pointer of Git LFS: fetch the file itself, by 'git lfs pull'")
-        parts = tuple(part for part in read(file, content) if len(part.faces))
+        parts = tuple(part for part in read(file, content(file, FileError)) if len(part.faces))
     except FileError:
         raise
     except Exception as error:  # Readers of damaged files fail in many ways.
@@ -101,7 +98,7 @@ def read_mesh(path: str) -> tuple[MeshPart, ...]:
     return parts
 
 
-def _read_plain(file: Path, content: bytes) -> list[MeshPart]:  # noqa: ARG001
+def _read_plain(file: Path, data: bytes) -> list[MeshPart]:  # noqa: ARG001
     """The triangles of a file without materials."""
     import trimesh  # noqa: PLC0415 - takes a while
 
@@ -109,7 +106,7 @@ def _read_plain(file: Path, content: bytes) -> list[MeshPart]:  # noqa: ARG001
     return [joined([MeshPart(_floats(mesh.vertices), np.asarray(mesh.faces, dtype=np.int64))])]
 
 
-def _read_wavefront(file: Path, content: bytes) -> list[MeshPart]:
+def _read_wavefront(file: Path, data: bytes) -> list[MeshPart]:
     from trimesh.exchange.obj import load_obj  # noqa: PLC0415 - takes a while
     from trimesh.geometry import triangulate_quads  # noqa: PLC0415 - as above
     from trimesh.resolvers import FilePathResolver  # noqa: PLC0415 - as above
@@ -129,7 +126,7 @@ def _read_wavefront(file: Path, content: bytes) -> list[MeshPart]:
         """The name of a file, which options may precede."""
         return words if is_file(file.parent / words) else words.rsplit(" ", maxsplit=1)[-1]
 
-    text = content.decode("utf-8", errors="replace").replace("\\\n", " ")
+    text = data.decode("utf-8", errors="replace").replace("\\\n", " ")
     if re.search(r"^[ \t]|^f.*-|^[fv].*#", text, re.MULTILINE):
         text = _simplified(text)
     loaded = load_obj(io.StringIO(text), resolver=Beside(str(file), allow_anywhere=True))
@@ -177,13 +174,13 @@ def _simplified(text: str) -> str:
     return "\n".join(map(counted, text.splitlines()))
 
 
-def _read_collada(file: Path, content: bytes) -> list[MeshPart]:
+def _read_collada(file: Path, data: bytes) -> list[MeshPart]:
     import collada  # noqa: PLC0415 - few robots need it
 
     try:
-        document = collada.Collada(io.BytesIO(content))
+        document = collada.Collada(io.BytesIO(data))
     except collada.DaeError as error:
-        root = ET.fromstring(content)
+        root = ET.fromstring(data)
         for parent in list(root.iter()):
             for child in [child for child in parent if child.tag.rpartition("}")[2] in _BESIDE]:
                 parent.remove(child)

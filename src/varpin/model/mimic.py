@@ -1,5 +1,6 @@
 """Mimic joints, leaders and followers, which are independent in Pinocchio's model; and models rebuilt."""
 
+import xml.etree.ElementTree as ET
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -7,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from varpin.errors import RobotError
-from varpin.model.urdf import Mimic, listed
+from varpin.model.urdf import listed
 
 # Attributes of a pin.Model with one number for each entry of a configuration.
 POSITION_LIMITS = ("lowerPositionLimit", "upperPositionLimit")
@@ -41,21 +42,23 @@ def joint_index(model: pin.Model) -> dict[str, int]:
     return {name: i for i, name in enumerate(model.names) if i > 0}
 
 
-def ties_of(mimics: Mapping[str, Mimic], model: pin.Model) -> tuple[tuple[Tie, ...], tuple[str, ...]]:
+def ties_of(root: ET.Element, model: pin.Model) -> tuple[tuple[Tie, ...], tuple[str, ...]]:
     """The ties of a URDF's mimic elements, and a remark on followers whose leaders are not there, which stay free.
 
-    Where a leader is itself a follower, the tie is to the leader of that one.
+    Where a leader is itself a follower, the tie is to the leader of that one. Pinocchio's parser has refused elements
+    without a leader, and numbers that are none.
     """
     index = joint_index(model)
     ties: dict[int, Tie] = {}
     alone = []
-    for name, mimic in mimics.items():
-        if name not in index:
-            continue
-        if mimic.leader not in index:
-            alone.append(f"{name!r} of {mimic.leader!r}")
-            continue
-        ties[index[name]] = Tie(index[name], index[mimic.leader], mimic.ratio, mimic.offset)
+    for joint in root.findall("joint[mimic]"):
+        name, mimic = joint.get("name", ""), joint.findall("mimic")[0]
+        leader = mimic.get("joint", "")
+        if name in index and leader in index:
+            numbers = float(mimic.get("multiplier", 1.0)), float(mimic.get("offset", 0.0))
+            ties[index[name]] = Tie(index[name], index[leader], *numbers)
+        elif name in index:
+            alone.append(f"{name!r} of {leader!r}")
     remark = f"mimic joints whose leaders are no moving joints of the robot stay free: {listed(alone, 'joints')}"
     remarks = (remark,) if alone else ()
     return tuple(_to_free_leader(tie, ties, model) for tie in ties.values()), remarks

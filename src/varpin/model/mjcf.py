@@ -15,9 +15,10 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
-from varpin.errors import MissingDependency, RobotError
-from varpin.model.equalities import Closure, End, Equality, Gear, rounded_plane
+from varpin.errors import RobotError
+from varpin.model.equalities import Closure, End, Equality, Gear, rounded_normal
 from varpin.model.meshes import MeshPart, coal_shape
+from varpin.model.packages import optional
 from varpin.model.urdf import captured_stderr, read_xml
 
 coal = pin.coal
@@ -59,14 +60,8 @@ def read_mjcf(path: Path) -> tuple[pin.Model, tuple[str, ...], tuple[Equality, .
     walk.add_parameters()
     equalities = walk.equalities()
     found = [f"{what} ({count})" for what, count in walk.left_out.items() if count]
-    remarks = [f"the file has {', '.join(found)}, which the model leaves out"] if found else []
-    remarks += [
-        f"{each.name} closes a planar loop, whose axes are parallel to {each.plane.tilt:.1g} rad in the file: it holds "
-        "in the plane of the loop alone"
-        for each in equalities
-        if isinstance(each, Closure) and each.plane is not None
-    ]
-    return walk.model, tuple(remarks), equalities
+    remarks = (f"the file has {', '.join(found)}, which the model leaves out",) if found else ()
+    return walk.model, remarks, equalities
 
 
 def mjcf_shapes(path: Path) -> tuple[pin.Model, pin.GeometryModel]:
@@ -79,10 +74,7 @@ class _Walk:
     """Pinocchio's model of an MJCF file, part by part."""
 
     def __init__(self, path: Path) -> None:
-        try:
-            import mujoco  # noqa: PLC0415
-        except ImportError:
-            raise MissingDependency(f"the MJCF file {path}", ["mujoco"], 'pip install "varpin[mjcf]"') from None
+        mujoco = optional("mujoco", f"the MJCF file {path}", "mjcf")
         try:
             with captured_stderr() as complaints, warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
@@ -337,8 +329,8 @@ class _Walk:
             places = [_placement(*here), _placement(*there)]
         a, b = (End(self.bodies[body], place) for body, place in zip(bodies, places, strict=True))
         carried = [(self.carriers[body], self.places[body] * place) for body, place in zip(bodies, places, strict=True)]
-        plane = None if turns else rounded_plane(self.model, *carried)
-        return Closure(f"<{'weld' if weld else 'connect'}> {m.eq(k).name or name!r}", a, b, turns, plane)
+        normal = None if turns else rounded_normal(self.model, *carried)
+        return Closure(f"<{'weld' if weld else 'connect'}> {m.eq(k).name or name!r}", a, b, turns, normal)
 
 
 def _named(names: Iterable[str], new: Callable[[int], str]) -> list[str]:

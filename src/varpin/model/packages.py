@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 import re
 import xml.etree.ElementTree as ET
@@ -10,11 +11,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
+from varpin.errors import FileError, MissingDependency, RobotError, VarpinError
 from varpin.support.frozen import Frozen
 
 # The first words of a file that Git LFS has not fetched.
-LFS_POINTER = b"version https://git-lfs"
+_LFS_POINTER = b"version https://git-lfs"
 
 # A given folder is a package, or contains packages.
 _MANIFESTS = ("package.xml", "*/package.xml")
@@ -40,13 +43,17 @@ class Packages(Frozen):
 
     file: Path  # the robot's file
     folders: tuple[str, ...] = ()  # that contain packages, or are packages
+    named: Mapping[str, str] = field(default_factory=dict)  # folders of packages by name
 
     @cached_property
     def places(self) -> tuple[Path, ...]:
-        """Folders that contain packages: the given ones, those around the file, those of a sourced ROS."""
-        ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
-        ament = [folder for folder in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if folder]
-        return tuple(Path(folder) for folder in (*self.folders, *ros, *(f"{folder}/share" for folder in ament)))
+        """Folders that contain packages: the given ones, those around the file, its own, those of a sourced ROS."""
+        ros, ament = (
+            [Path(folder) for folder in os.environ.get(name, "").split(os.pathsep) if folder]
+            for name in ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH")
+        )
+        around = [*(package.parent for package in self.around.values()), self.file.parent]
+        return tuple(dict.fromkeys([*map(Path, self.folders), *around, *ros, *(folder / "share" for folder in ament)]))
 
     @cached_property
     def around(self) -> dict[str, Path]:
@@ -61,8 +68,8 @@ class Packages(Frozen):
 
     def folder(self, name: str) -> Path | None:
         """The folder of a package: one around the file, one of that name, or one whose ``package.xml`` has it."""
-        if name in self.around:
-            return self.around[name]
+        if found := self.named.get(name) or self.around.get(name):
+            return Path(found)
         near = [*(folder for folder in self.file.absolute().parents if folder.name == name)]
         near += [place / name for place in self.places]
         return next((folder.absolute() for folder in near if folder.is_dir()), self.below.get(name))
@@ -85,19 +92,6 @@ class Packages(Frozen):
         """The path of a file; None if it does not exist."""
         return next((path.absolute() for path in self.candidates(name) if path.is_file()), None)
 
-    def in_other_case(self, name: str) -> Path | None:
-        """A file whose path differs from ``name`` in upper and lower case alone; None if there is none."""
-        for path in map(Path.absolute, self.candidates(name)):
-            found = Path(path.anchor)
-            for part in path.parts[1:]:
-                exact = found / part
-                if not exact.exists() and found.is_dir():
-                    exact = next((own for own in found.iterdir() if own.name.lower() == part.lower()), exact)
-                found = exact
-            if found.is_file():
-                return found
-        return None
-
 
 def _named(manifests: Iterator[Path]) -> Iterator[tuple[str, Path]]:
     """Names and folders of packages."""
@@ -105,3 +99,22 @@ def _named(manifests: Iterator[Path]) -> Iterator[tuple[str, Path]]:
         with contextlib.suppress(ET.ParseError, OSError):
             name = ET.parse(manifest).getroot().findtext("name") or manifest.parent.name
             yield name.strip(), manifest.parent
+
+
+def content(path: Path, unfetched: type[VarpinError] = RobotError) -> bytes:
+    """What is in a file; an error, ``unfetched``, if Git LFS has not fetched it."""
+    try:
+        found = path.read_bytes()
+    except OSError as error:
+        raise FileError(f"cannot read {path}: {error.strerror}") from None
+    if found.startswith(_LFS_POINTER):
+        raise unfetched(f"{path} is a Git LFS pointer, not the file itself: git lfs pull downloads it")
+    return found
+
+
+def optional(module: str, purpose: str, extra: str) -> Any:
+    """A module of one of varpin's extras; a MissingDependency if it is not installed."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MissingDependency(purpose, [error.name or module], f'pip install "varpin[{extra}]"') from None

@@ -15,15 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats
 from varpin.core.arrays import Tree
-from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint, UnknownPosture
+from varpin.errors import InputError, RobotError, UnknownJoint, UnknownPosture
 from varpin.model.equalities import Equality
-from varpin.model.inertia import faults
 from varpin.model.kinematics import place_on_body
 from varpin.model.meshes import Reader, read_mesh, with_own_meshes
 from varpin.model.mimic import Tie, rebuild
 from varpin.model.mjcf import mjcf_shapes
 from varpin.model.srdf import Posture
-from varpin.model.tree import flatten, mechanism, place_of_frame, to_pinocchio
+from varpin.model.tree import flatten, place_of_frame
 from varpin.model.units import NO_LIMIT
 from varpin.model.urdf import Inertial, build_shapes, listed, read_urdf
 from varpin.support import markup
@@ -58,7 +57,7 @@ class Robot(Frozen):
         urdf: The URDF or xacro file the robot was read from, or None.
         expanded: The URDF text of a xacro file.
         mjcf: The MJCF file the robot was read from, or None.
-        package_dirs: Folders in which meshes are looked up.
+        package_dirs: Folders in which packages are looked up, besides those around the file.
         visuals: Geometry that came with a RobotWrapper, locked like the model, or None.
         group_states: The postures that :meth:`posture` reads.
         parts: The robots of a combined robot, see :func:`combine`; empty for others.
@@ -67,7 +66,6 @@ class Robot(Frozen):
         equalities: Equality constraints of an MJCF file; ``Scene(constraints="robot")`` takes them.
         inertials: Inertias of the links of a URDF, which the model merges into bodies.
         remarks: How the source is read where that is not plain, in words.
-        notes: What of the source has no effect on purpose, likewise.
         faults: What its masses lack, likewise.
     """
 
@@ -86,7 +84,6 @@ class Robot(Frozen):
     equalities: tuple[Equality, ...] = field(default=(), repr=False)
     inertials: tuple[Inertial, ...] = field(default=(), repr=False)
     remarks: tuple[str, ...] = field(default=(), repr=False)
-    notes: tuple[str, ...] = field(default=(), repr=False)
     faults: tuple[str, ...] = field(default=(), repr=False)
 
     def __repr__(self) -> str:
@@ -116,11 +113,6 @@ class Robot(Frozen):
         """The robot with its model rebuilt; see :func:`varpin.model.mimic.rebuild`."""
         new = rebuild(self.model, **changes)
         return self.changed(model=new.model, ties=new.ties(self.ties), visuals=new.shapes(self.visuals))
-
-    @property
-    def free_model(self) -> pin.Model:
-        """:attr:`model`: in both, mimic joints are free."""
-        return self.model
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
@@ -201,7 +193,14 @@ class Robot(Frozen):
             InputError: The last dimension of ``q`` is not n.
         """
         joints = self._rows("q", q)[..., self.tree.coordinate]
-        return to_pinocchio(self.model, joints * self.tree.ratio + self.tree.offset)
+        positions = joints * self.tree.ratio + self.tree.offset
+        found = np.empty((*positions.shape[:-1], self.model.nq))
+        for joint, position in zip(self.model.joints[1:], np.moveaxis(positions, -1, 0), strict=True):
+            # Pinocchio keeps the angle of a continuous joint as its cosine and sine.
+            parts = (position,) if joint.nq == 1 else (np.cos(position), np.sin(position))
+            for k, part in enumerate(parts, joint.idx_q):
+                found[..., k] = part
+        return found
 
     def velocity(self, v: ArrayLike) -> Floats:
         """``v`` (..., n) as velocities (..., model.nv) of ``model``: linear in v; errors as :meth:`configuration`."""
@@ -234,20 +233,13 @@ class Robot(Frozen):
         return np.asarray(positions.reshape(*q.shape[:-1], 3), dtype=np.float64)
 
     @property
-    def unbounded(self) -> NDArray[np.bool_]:
-        """Whether each coordinate (n,) is an angle without limits."""
-        lower, upper = self.position_limits
-        return ~self.slides & np.isinf(lower) & np.isinf(upper)
-
-    @property
     def position_limits(self) -> tuple[Floats, Floats]:
         """Lower and upper bounds (n,), (n,) [rad or m]; infinite where there are none.
 
         Two bounds of 0 count as none, since a URDF without limits is read so; to hold a joint still, lock it. A leader
         keeps within the limits of the mimic joints that follow it, unless they leave it no room.
         """
-        lower, upper, _, _ = self._limits[0]
-        return lower, upper
+        return self._limits[:2]
 
     @property
     def velocity_limit(self) -> Floats:
@@ -255,7 +247,7 @@ class Robot(Frozen):
 
         The bound of a mimic joint is one of its leader.
         """
-        return self._limits[0][2]
+        return self._limits[2]
 
     @property
     def effort_limit(self) -> Floats:
@@ -263,12 +255,12 @@ class Robot(Frozen):
 
         The bound of a mimic joint is one of its leader: what the leader exerts, the follower has to bear.
         """
-        return self._limits[0][3]
+        return self._limits[3]
 
     @cached_property
-    def _limits(self) -> tuple[tuple[Floats, Floats, Floats, Floats], tuple[str, ...]]:
-        """All limits of the coordinates, and the followers whose limits would leave their leader no room."""
-        lower, velocity, left_out = np.full(self.dof, -np.inf), np.full(self.dof, np.inf), []
+    def _limits(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """All limits of the coordinates: lower, upper, of velocities, of efforts."""
+        lower, velocity = np.full(self.dof, -np.inf), np.full(self.dof, np.inf)
         upper, effort, tree = velocity.copy(), velocity.copy(), self.tree
         for joint in (*self._coordinates, *(tie.follower for tie in self.ties)):
             c, ratio, offset = (values[joint - 1] for values in (tree.coordinate, tree.ratio, tree.offset))
@@ -280,21 +272,16 @@ class Robot(Frozen):
             low, high = max(low, lower[c]), min(high, upper[c])
             if joint in self._coordinates or low < high:
                 lower[c], upper[c] = low, high
-            else:
-                left_out.append(self.model.names[joint])
         limits = lower, upper, velocity, effort
         for limit in limits:
             limit.setflags(write=False)
-        return limits, tuple(left_out)
+        return limits
 
     def limit_remarks(self) -> Iterator[str]:
-        """What is odd about limits, one sentence a kind."""
+        """A sentence about limits without room between them, if there are any."""
         bounds = zip(self.joint_names, *self.position_limits, strict=True)
         if tight := [f"{low:g} and {high:g} of {name!r}" for name, low, high in bounds if not low < high]:
             yield f"limits leave no room to move (lock= holds a joint): {listed(tight, 'joints')}"
-        if names := self._limits[1]:
-            joints = listed(map(repr, names), "mimic joints")
-            yield f"limits that leave the joint that a mimic joint follows no room are left out: those of {joints}"
 
     @property
     def damping(self) -> Floats:
@@ -410,34 +397,3 @@ def _hang(robot: Robot, full: pin.Model, shapes: pin.GeometryModel, prefix: str 
         shape.placement = frame.placement * link.placement.inverse() * shape.placement
         shape.parentJoint = frame.parentJoint
     return shapes
-
-
-def check_inertia(robot: Robot) -> None:
-    """Refuse a robot whose mass matrix is singular at q = 0 or at a few seeded random configurations."""
-    rng, core = np.random.default_rng(0), mechanism(robot.tree)
-    for q in [np.zeros(robot.dof), *rng.uniform(-np.pi, np.pi, (3, robot.dof))]:
-        with np.errstate(all="ignore"):
-            M = core.jet(q, np.zeros(robot.dof))[-1]
-        if not np.isfinite(M).all():
-            raise RobotError(
-                f"the mass matrix of robot {robot.name!r} is not finite: masses, inertias, distances or "
-                "mimic multipliers are beyond the range of floating-point numbers"
-            )
-        inertia = np.diag(M)
-        faulty = inertia <= 0.0
-        negative = bool((inertia < 0.0).any())
-        if negative:
-            faulty = inertia < 0.0
-        elif not faulty.any():
-            scale = np.sqrt(inertia)
-            values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
-            rounding = robot.dof * np.finfo(float).eps
-            if values[0] > rounding:
-                continue
-            worst, negative = np.abs(vectors[:, 0]), bool(values[0] < -rounding)
-            faulty = worst >= 0.5 * worst.max()
-        # Beside a link of a billion kg every other inertia is a rounding error.
-        heavy = next((text for text in faults(robot.model, ()) if " has a mass of " in text), "")
-        raise SingularMassMatrix(
-            np.array(robot.joint_names)[faulty].tolist(), negative=negative, cause=heavy, hint="".join(robot.faults[:1])
-        )

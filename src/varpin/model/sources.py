@@ -1,4 +1,4 @@
-"""Sources of robots: files, bundled robots, example-robot-data, robot_descriptions, models in memory."""
+"""Robots from files and from models in memory."""
 
 from __future__ import annotations
 
@@ -12,44 +12,19 @@ from typing import Literal
 import numpy as np
 import pinocchio as pin
 
-from varpin.errors import FileError, InputError, RobotError, RobotNotFound
-from varpin.model import example_robot_data, robot_descriptions
+from varpin.errors import FileError, InputError, RobotError
 from varpin.model.equalities import Closure
 from varpin.model.mimic import JOINT_PARAMETERS, POSITION_LIMITS, depth_first, joint_frames, of_mimics, ties_of
 from varpin.model.mjcf import is_mjcf, read_mjcf
+from varpin.model.names import find
 from varpin.model.packages import Files, Packages
 from varpin.model.robot import Robot
 from varpin.model.srdf import beside, read_srdf, reference_postures
 from varpin.model.urdf import read_urdf
-from varpin.model.xacro import expand, is_xacro, plain_name
-from varpin.support.checks import is_file, path_like, word
+from varpin.model.xacro import expand, is_xacro
+from varpin.support.checks import path_like, word
 
 logger = logging.getLogger(__name__)
-
-# Suffixes of robots' files.
-_SUFFIXES = (".urdf", ".xacro", ".xml", ".mjcf")
-
-
-def models_dir() -> Path:
-    """The folder of the bundled robots: in the wheel, or at the top of a source tree."""
-    package = Path(__file__).resolve().parents[1]
-    for folder in (package / "models", package.parents[1] / "models"):
-        if (folder / "SOURCES.md").is_file():
-            return folder
-    raise FileError(f"varpin's bundled models are missing beside {package}")
-
-
-def bundled_robots() -> dict[str, Path]:
-    """Files of the robots bundled with varpin, by name."""
-    return {path.stem: path for path in sorted(models_dir().glob("*.urdf"))}
-
-
-def robot_names() -> tuple[str, ...]:
-    """The names that :func:`varpin.load_robot` takes: varpin's own robots, then those of example-robot-data.
-
-    The latter are the fixed-base robots in the installed version of example-robot-data, if it is installed.
-    """
-    return (*bundled_robots(), *example_robot_data.installed())
 
 
 def describe(
@@ -68,7 +43,7 @@ def describe(
     if xacro_args is not None and not isinstance(xacro_args, Mapping):
         raise InputError(f"xacro_args must be a mapping of names to values, got {xacro_args!r}")
     arguments, path = xacro_args or {}, None if srdf is None else path_like("srdf", srdf)
-    files = _find(source) if isinstance(source, str | os.PathLike) else Files("", Path())
+    files = find(source) if isinstance(source, str | os.PathLike) else Files("", Path())
     files = replace(
         files,
         folders=(*_folders(package_dirs), *files.folders),
@@ -94,39 +69,6 @@ def describe(
     if xacro_args and robot.expanded is None:
         raise InputError(f"xacro_args need a xacro file; {robot.name!r} does not come from one")
     return _with_srdf(robot if mimic == "tied" else robot.changed(ties=()), files)
-
-
-def _find(source: str | os.PathLike[str]) -> Files:
-    """The files of a path or a name."""
-    text = os.fspath(source)
-    if text.lstrip("\ufeff \t\r\n").startswith("<"):
-        raise InputError(
-            "source is the text of a file, not its path: write it to a file, or give pin.buildModelFromXML(text)"
-        )
-    path = path_like("source", source)
-    is_path = isinstance(source, os.PathLike) or path.suffix or os.sep in text
-    if is_path and is_file(path):
-        return Files(plain_name(path), path.resolve())
-    bundled = bundled_robots()
-    if text in bundled:
-        return Files(text, bundled[text])
-    if found := example_robot_data.find(text):
-        return found
-    downloadable = robot_descriptions.names()
-    if text in downloadable or (not downloadable and not is_path and text.endswith(robot_descriptions.SUFFIX)):
-        return robot_descriptions.download(text)
-    if is_path and os.path.isdir(path):  # noqa: PTH112 - False for a name that is too long
-        files = ", ".join(sorted(file.name for file in path.glob("*.urdf"))) or "no URDF file"
-        raise RobotError(f"{path} is a folder, not a URDF file; it contains {files}")
-    if is_path:
-        folder = path.absolute().parent
-        if not folder.is_dir():
-            raise RobotNotFound(text, (), f": there is no folder {folder}")
-        there = [file.name for file in folder.iterdir() if file.suffix in _SUFFIXES]
-        raise RobotNotFound(path.name, there, f" in the folder {folder}")
-    # Without the package its names are unknown.
-    more = "" if downloadable else robot_descriptions.INSTALL
-    raise RobotNotFound(text, [*robot_names(), *downloadable], more=more)
 
 
 def _folders(package_dirs: Sequence[str | os.PathLike[str]] | str | os.PathLike[str] | None) -> tuple[str, ...]:
@@ -174,33 +116,26 @@ def _check_model(model: pin.Model, name: str) -> None:
 def _of_files(files: Files, *, tied: bool) -> Robot:
     path, text = files.path, None
     if is_xacro(path):
-        text = expand(path, files.xacro_args, _places(path, files.folders), files.packages)
+        text = expand(Packages(path, files.folders, files.packages), files.xacro_args)
     elif is_mjcf(path):
         model, remarks, equalities = read_mjcf(path)
         loops = tuple((each.a.body, each.b.body) for each in equalities if isinstance(each, Closure))
         robot = _of_model(model, files.name, None)
         return robot.changed(mjcf=path, remarks=remarks, loops=loops, equalities=equalities)
     urdf = read_urdf(path, text)
-    ties, alone = ties_of(urdf.mimics, urdf.model) if tied else ((), ())
+    ties, alone = ties_of(urdf.root, urdf.model) if tied else ((), ())
     return Robot(
         files.name,
         urdf.model,
         ties,
         urdf=path,
         expanded=text,
-        package_dirs=_places(path, files.folders),
+        package_dirs=files.folders,
         loops=urdf.loops,
         inertials=urdf.inertials,
         remarks=(*urdf.remarks, *alone),
-        notes=urdf.notes,
         faults=urdf.faults,
     )
-
-
-def _places(path: Path, folders: tuple[str, ...]) -> tuple[str, ...]:
-    """Folders in which the packages of a file are looked up: ``folders``, those of its enclosing packages, its own."""
-    around = (str(package.parent) for package in Packages(path).around.values())
-    return tuple(dict.fromkeys((*folders, *around, str(path.parent))))
 
 
 def _with_srdf(robot: Robot, files: Files) -> Robot:
@@ -211,9 +146,10 @@ def _with_srdf(robot: Robot, files: Files) -> Robot:
     states = robot.group_states
     if path is not None:
         try:
-            # A xacro file need not take all of the robot's arguments.
-            places = _places(path, files.folders)
-            text = expand(path, files.srdf_args, places, files.packages, strict=False) if is_xacro(path) else None
+            text = None
+            if is_xacro(path):
+                # It need not take all of the robot's arguments.
+                text = expand(Packages(path, files.folders, files.packages), files.srdf_args, strict=False)
             states, rotors = read_srdf(path, text)
         except (RobotError, FileError) as error:
             if files.srdf is not None:

@@ -111,18 +111,17 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
     )
 
 
-def frame_index(model: pin.Model, frame: str, robot: str) -> int:
-    """Index of a frame by its name: the link's where a joint that may be elsewhere has the same."""
-    names = [item.name for item in model.frames]
-    if not isinstance(frame, str) or frame not in names:
-        raise UnknownFrame(str(frame), names, f"robot {robot!r} has no frame")
-    found = [index for index, name in enumerate(names) if name == frame]
-    return next((index for index in found if model.frames[index].type == pin.FrameType.BODY), found[0])
+def frame_of(model: pin.Model, name: str, robot: str) -> pin.Frame:
+    """The frame of a name: the link's where a joint that may be elsewhere has the same."""
+    found = [frame for frame in model.frames if frame.name == name] if isinstance(name, str) else []
+    if not found:
+        raise UnknownFrame(str(name), [frame.name for frame in model.frames], f"robot {robot!r} has no frame")
+    return next((frame for frame in found if frame.type == pin.FrameType.BODY), found[0])
 
 
 def place_of_frame(model: pin.Model, frame: str, robot: str) -> tuple[int, Floats, Floats]:
     """The body of the flat tree that carries a frame, -1 for the world, and its rotation and position in that body."""
-    found = model.frames[frame_index(model, frame, robot)]
+    found = frame_of(model, frame, robot)
     joint, R, at = found.parentJoint, found.placement.rotation.copy(), found.placement.translation.copy()
     if joint == 0:
         return -1, R, at
@@ -130,28 +129,10 @@ def place_of_frame(model: pin.Model, frame: str, robot: str) -> tuple[int, Float
     return joint - 1, turn.T @ R, turn.T @ at
 
 
-def to_pinocchio(model: pin.Model, positions: Floats) -> Floats:
-    """Joint positions (..., k), of the joints that are no mimic joints, as configurations (..., model.nq) of a model.
-
-    The angle of a continuous joint becomes Pinocchio's (cos, sin).
-    """
-    configuration = np.empty((*positions.shape[:-1], model.nq))
-    for k, joint in enumerate(joint for joint in model.joints[1:] if joint.nv):
-        if joint.nq == 2:
-            configuration[..., joint.idx_q] = np.cos(positions[..., k])
-            configuration[..., joint.idx_q + 1] = np.sin(positions[..., k])
-        else:
-            configuration[..., joint.idx_q] = positions[..., k]
-    return configuration
-
-
 def origins(parent: Integers, prismatic: Integers) -> Integers:
     """Whether each body (b,) has only prismatic joints above its own: 1 or 0."""
-    origin = np.ones(len(parent), dtype=np.int64)
-    for body, above in enumerate(parent):
-        if above >= 0:
-            origin[body] = origin[above] and prismatic[above]
-    return origin
+    turns_above = (ancestors(parent) & (prismatic == 0)).sum(axis=1) - (prismatic == 0)
+    return np.asarray(turns_above == 0, dtype=np.int64)
 
 
 # A part is light if its share of the inertia about a joint above it is below this.
@@ -178,9 +159,7 @@ def _light_parts(tree: Mapping[str, Any], dof: int) -> tuple[Integers, Integers]
     parent, prismatic, mass = tree["parent"], tree["prismatic"], tree["mass"]
     bodies = len(parent)
     is_ancestor = ancestors(parent)
-    path = np.zeros(bodies)  # length along the offsets between joints, from the root
-    for b in range(bodies):
-        path[b] = np.linalg.norm(tree["translation"][b]) + (path[parent[b]] if parent[b] >= 0 else 0.0)
+    path = is_ancestor @ np.linalg.norm(tree["translation"], axis=1)  # along the offsets between joints, from the root
     # [a, b]: inertia of body b about the joint of its ancestor a.
     with np.errstate(over="ignore", invalid="ignore"):
         reach = np.linalg.norm(tree["center"], axis=1) + path - path[:, None]
@@ -236,13 +215,14 @@ def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Inte
     return np.asarray(np.unique(label, return_inverse=True)[1], dtype=np.int64)
 
 
+def path_to(tree: Tree, body: int) -> Integers:
+    """The bodies from the root to a body; none to the world, -1."""
+    return np.flatnonzero(ancestors(tree.parent)[body] if body >= 0 else [])
+
+
 def path_coordinates(tree: Tree, body: int) -> Integers:
     """The coordinates that move a body; empty for the world, -1."""
-    found = []
-    while body >= 0:
-        found.append(int(tree.coordinate[body]))
-        body = int(tree.parent[body])
-    return np.array(found, dtype=np.int64)
+    return tree.coordinate[path_to(tree, body)]
 
 
 def block_ends(group: Integers) -> Integers:

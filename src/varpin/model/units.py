@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,11 +17,10 @@ if TYPE_CHECKING:
 
 # Largest plausible angle [rad]: two turns.
 _TURNS = 4.0 * math.pi
-# Degrees up to this are plausible.
-_DEGREES = 1e6
 ADVICE = "angles are in radians, np.deg2rad makes them of degrees"
 
-# A joint whose limit is larger [rad or m] has none: exporters write 1e9, 1e16 or the largest double.
+# A joint whose limit is larger [rad or m] has none: exporters write 1e9, 1e16 or the largest double. Nobody types
+# larger angles in degrees.
 NO_LIMIT = 1e6
 
 # Largest plausible length in a robot's surroundings, in units of its reach: a larger one looks like millimetres.
@@ -57,8 +56,8 @@ def looks_like_degrees(angle: float) -> bool:
 
 def typed_in_degrees(angles: Floats) -> NDArray[np.bool_]:
     """Whether angles [rad] are larger than two turns and have at most one decimal, as someone types degrees."""
-    tenths = 10.0 * np.clip(angles, -_DEGREES, _DEGREES)
-    return (np.abs(angles) > _TURNS) & (np.abs(angles) < _DEGREES) & (tenths == np.round(tenths))
+    tenths = 10.0 * np.clip(angles, -NO_LIMIT, NO_LIMIT)
+    return (np.abs(angles) > _TURNS) & (np.abs(angles) < NO_LIMIT) & (tenths == np.round(tenths))
 
 
 def degrees_hint(robot: Robot, name: str, values: Floats, *, speed: bool = False) -> str:
@@ -94,20 +93,19 @@ def longest_reach(robot: Robot, *, slides: bool = True, centers: bool = True) ->
     return float((path + (np.linalg.norm(tree.center, axis=1) if centers else 0.0)).max())
 
 
-def odd_sizes(robot: Robot, payload: Iterable[Payload]) -> Iterator[str]:
+def odd_sizes(robot: Robot, payload: Sequence[Payload]) -> Iterator[str]:
     """Sentences about links and payloads whose sizes look like millimetres or grams."""
     tree, names = robot.tree, robot.model.names
     hops = np.where(tree.parent >= 0, np.linalg.norm(tree.translation, axis=1), 0.0)
-    body, carried = int(np.argmax(hops)), tuple(payload)
+    body = int(np.argmax(hops))
     if hops[body] > _LONG:
         joints = f"{names[int(tree.parent[body]) + 1]!r} and {names[body + 1]!r}"
         yield f"the link between joints {joints} is {hops[body]:.4g} m long: {IN_MILLIMETRES}"
-    span = max(longest_reach(robot, centers=False), _LEAST)
-    mass = sum(own.mass for own in robot.model.inertias) - sum(part.mass for part in carried)
-    for part in carried:
-        away = float(np.linalg.norm(part.center))
-        if away > AFAR * span:
-            yield f"the payload has its centre {away:.4g} m from frame {part.frame!r}: {IN_MILLIMETRES}"
+    mass = sum(own.mass for own in robot.model.inertias) - sum(part.mass for part in payload)
+    for part in payload:
+        away = {f"the distance of the payload's centre from frame {part.frame!r}": float(np.linalg.norm(part.center))}
+        if sentence := millimetres_hint(robot, away):
+            yield sentence
         if part.mass > _BURDEN * mass > 0.0:
             heavy = f"the payload at frame {part.frame!r} weighs {part.mass:.4g} kg, and the robot {mass:.3g} kg"
             yield f"{heavy}: it may be in grams, and masses are in kg"
@@ -119,7 +117,7 @@ def millimetres_hint(robot: Robot, lengths: dict[str, float], plausible: float =
     Lengths up to ``plausible`` times the robot's reach do not.
     """
     name, length = max(lengths.items(), key=lambda own: own[1])
-    reach = longest_reach(robot)
+    reach = longest_reach(robot, centers=False)
     if not length > plausible * max(reach, _LEAST):
         return ""
     return f"{name} is {length:.4g} m, and the reach of {robot.name} at most {reach:.3g} m: {IN_MILLIMETRES}"

@@ -7,6 +7,7 @@ exporters write for "none". Everything else, with the version of URDF that it de
 from __future__ import annotations
 
 import contextlib
+import copy
 import logging
 import math
 import os
@@ -17,10 +18,10 @@ import tempfile
 import textwrap
 import threading
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from xml.parsers import expat
 
 import numpy as np
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 
 from varpin.errors import FileError, RobotError
 from varpin.model.meshes import Reader, put_mesh, read_mesh
-from varpin.model.packages import LFS_POINTER, Packages
+from varpin.model.packages import Packages, content
 from varpin.model.units import NO_LIMIT, typed_in_degrees
 from varpin.support.frozen import Frozen
 
@@ -46,14 +47,6 @@ COMMENT = re.compile(rb"<!--.*?-->|(<!\[CDATA\[.*?\]\]>)", re.DOTALL)
 
 # One thread at a time redirects the stderr of the process.
 _STDERR = threading.Lock()
-
-
-class Mimic(NamedTuple):
-    """A mimic element: the joint is at ratio * (position of joint ``leader``) + offset."""
-
-    leader: str
-    ratio: float
-    offset: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,11 +66,9 @@ class Urdf:
     path: Path
     root: ET.Element = field(repr=False)  # with prefixes of names as written
     model: pin.Model = field(repr=False)  # in which mimic joints are independent
-    mimics: Mapping[str, Mimic]  # by joint
     inertials: tuple[Inertial, ...] = field(repr=False)  # of the links that have one
     faults: tuple[str, ...]  # what Pinocchio leaves out of links and joints, in words
     remarks: tuple[str, ...]  # how the file is read where that is not plain, one sentence a kind
-    notes: tuple[str, ...]  # what of the file has no effect on purpose, likewise
 
     @property
     def loops(self) -> tuple[tuple[str, str], ...]:
@@ -101,13 +92,10 @@ def read_urdf(path: Path, text: str | None = None) -> Urdf:
                 f"{path}: link {link!r} is the child of joints {parent[link]!r} and {name!r}: "
                 "varpin takes trees, no closed loops"
             )
-    mimics = {joint.get("name", ""): _mimic(joint, path) for joint in root.findall("joint[mimic]")}
     remarks = tuple(_remarks(root))
-    soft = _joints_with(root, "safety_controller")
-    notes = (f"soft limits of <safety_controller> have no effect: {listed(soft, 'joints')}",) if soft else ()
     model, inertials, complaint = _model(root, path)
     faults = (f"Pinocchio reads links in part: {complaint}",) if complaint else ()
-    return Urdf(path, root, model, mimics, inertials, faults, remarks, notes)
+    return Urdf(path, root, model, inertials, faults, remarks)
 
 
 def _model(root: ET.Element, path: Path) -> tuple[pin.Model, tuple[Inertial, ...], str]:
@@ -166,14 +154,15 @@ def build_shapes(
     text = ET.tostring(root, encoding="unicode")
     with captured_stderr() as complaints:
         try:
-            shapes = pin.buildGeomFromUrdfString(urdf.model, text, pin.GeometryType.VISUAL, None, [*package_dirs])
+            shapes = pin.buildGeomFromUrdfString(urdf.model, text, pin.GeometryType.VISUAL)
         except (ValueError, RuntimeError, IndexError) as error:
             raise RobotError(f"the shapes in {urdf.path} cannot be read: {error}") from None
         lines = complaints()
     if lines:
         logger.warning("%s: shapes are read in part: %s", urdf.path, textwrap.shorten("; ".join(lines), _COMPLAINT))
     packages = Packages(urdf.path, tuple(package_dirs))
-    faults = _missing_meshes(urdf, packages)
+    faults: dict[str, str] = {}
+    missing: dict[str, list[str]] = {}
     for shape in shapes.geometryObjects:
         link, mesh, texture = looks.get(shape.name, ("", None, ""))
         if texture:
@@ -181,15 +170,24 @@ def build_shapes(
             if image is None:
                 logger.warning("%s: texture %r is not there", urdf.path, texture)
             shape.meshTexturePath = "" if image is None else str(image)
-        if mesh is not None and link not in faults:
-            file, words = mesh.get("filename", ""), mesh.get("scale", "1 1 1")
+        if mesh is None:
+            continue
+        file, words = mesh.get("filename", ""), mesh.get("scale", "1 1 1")
+        if path := packages.locate(file):
             scale = [_number(word) for word in words.split()]
             try:
                 if len(scale) != 3 or not all(math.isfinite(number) and number for number in scale):
                     raise FileError(f"mesh {file} has the scale {words!r}: give three numbers other than 0")
-                put_mesh(shape, str(packages.locate(file)), scale, read)
+                put_mesh(shape, str(path), scale, read)
             except FileError as error:
                 faults[link] = f"link {link!r}: {error}"
+        else:
+            missing.setdefault(link, []).append(file)
+    if missing:
+        links = listed((f"link {link!r}: {', '.join(files)}" for link, files in missing.items()), "links")
+        places = ", ".join(map(str, packages.places)) or "no folder"
+        message = f"meshes of {urdf.path} are missing: {links}; looked beside the file and in {places}"
+        faults |= dict.fromkeys(missing, f"{message} (package_dirs=[...] adds)")
     found = pin.GeometryModel()
     for shape in shapes.geometryObjects:
         if shape.name not in looks or looks[shape.name][0] not in faults:
@@ -197,40 +195,18 @@ def build_shapes(
     return found, faults
 
 
-def _missing_meshes(urdf: Urdf, packages: Packages) -> dict[str, str]:
-    """The links whose visual meshes are missing, each with the message about all of them."""
-    missing: dict[str, list[str]] = {}
-    for link in urdf.root.findall("link"):
-        for mesh in link.iterfind("visual/geometry/mesh"):
-            if packages.locate(file := mesh.get("filename", "")) is None:
-                missing.setdefault(link.get("name", ""), []).append(file)
-    if not missing:
-        return {}
-    links = listed((f"link {link!r}: {', '.join(files)}" for link, files in missing.items()), "links")
-    message = f"meshes of {urdf.path} are missing: {links}; "
-    if there := packages.in_other_case(next(iter(missing.values()))[0]):
-        return dict.fromkeys(missing, f"{message}{there} is there, in other upper and lower case")
-    places = ", ".join(map(str, packages.places)) or "no folder"
-    return dict.fromkeys(missing, f"{message}looked beside the file and in {places} (package_dirs=[...] adds)")
-
-
 def read_xml(path: Path, text: str | None = None, kind: str = "") -> ET.Element:
     """The elements of an XML file without texts, prefixes as written; the root of a URDF or an SRDF is ``<robot>``."""
-    try:
-        content = path.read_bytes() if text is None else text.encode()
-    except OSError as error:
-        raise FileError(f"cannot read {path}: {error.strerror}") from None
-    if content.startswith(LFS_POINTER):
-        raise RobotError(f"{path} is a Git LFS pointer, not the file itself: git lfs pull downloads it")
+    data = (content(path) if text is None else text.encode()).lstrip(b" \t\r\n")
     # Comments often contain "--", which XML forbids. Their line breaks stay, for line numbers.
-    content = COMMENT.sub(lambda found: found[1] or b"\n" * found[0].count(b"\n"), content.lstrip(b" \t\r\n"))
+    data = COMMENT.sub(lambda found: found[1] or b"\n" * found[0].count(b"\n"), data)
     builder, parser = ET.TreeBuilder(), expat.ParserCreate()
     parser.StartElementHandler = lambda tag, has: builder.start(tag, {key: text.strip() for key, text in has.items()})
     parser.EndElementHandler = builder.end
     try:
-        parser.Parse(content, True)
+        parser.Parse(data, True)
     except (expat.ExpatError, LookupError) as error:
-        raise RobotError(f"{path} is {f'not well-formed XML: {error}' if content else 'empty'}") from None
+        raise RobotError(f"{path} is {f'not well-formed XML: {error}' if data else 'empty'}") from None
     root = builder.close()
     if kind and root.tag != "robot":
         raise RobotError(f"{path} is not a {kind}: its root element is <{root.tag}>, not <robot>")
@@ -248,16 +224,9 @@ def _remarks(root: ET.Element) -> Iterator[str]:
 
     Two bounds of 0 are none as well, as a URDF before version 1.2 without bounds is read.
     """
-    left = _xacro(root)
-    left |= {
-        f"<{part.tag} {key}={value!r}>": None
-        for part in root.iter()
-        for key, value in part.items()
-        if key != "filename" and ("${" in value or value.startswith("$(")) and part.tag not in left
-    }
-    if left:
+    if left := _xacro(root):
         yield f"leftover xacro elements have no effect: {listed(left, 'kinds')}"
-    stated, none, degrees, ignored = root.get("version") == "1.2", [], [], []
+    stated, none, degrees = root.get("version") == "1.2", [], []
     for joint in root.findall("joint"):
         name, kind, limit = repr(joint.get("name", "")), joint.get("type"), joint.find("limit")
         if limit is None and kind in ("revolute", "prismatic"):
@@ -265,8 +234,6 @@ def _remarks(root: ET.Element) -> Iterator[str]:
         if limit is None:
             continue
         low, high = (_number(limit.get(key)) for key in ("lower", "upper"))
-        if kind == "continuous" and low < high and high - low < NO_LIMIT:
-            ignored.append(name)
         if kind == "revolute" and typed_in_degrees(np.array([low, high])).any():
             degrees.append(f"{low:g} to {high:g} of {name}")
         bounded, minus_one = bool({"lower", "upper"} & set(limit.keys())), low == high == -1.0
@@ -283,27 +250,8 @@ def _remarks(root: ET.Element) -> Iterator[str]:
                 none.append(f"no {key} of {name}" if word is None else f"{key} {word} of {name}")
     if degrees:
         yield f"limits look like degrees, and URDF has radians: {listed(degrees, 'joints')}"
-    if ignored:
-        yield f"limits of continuous joints have no effect (type revolute has limits): {listed(ignored, 'joints')}"
     if none:
         yield f"limits that are missing, infinite, negative or huge count as none: {listed(none, 'limits')}"
-    if named := _joints_with(root, "joint_properties"):
-        yield f"<joint_properties> has no effect, URDF calls it <dynamics>: {listed(named, 'joints')}"
-
-
-def _joints_with(root: ET.Element, tag: str) -> list[str]:
-    return [repr(joint.get("name", "")) for joint in root.findall(f"joint[{tag}]")]
-
-
-def _mimic(joint: ET.Element, path: Path) -> Mimic:
-    element, where = joint.findall("mimic")[0], f"{path}: joint {joint.get('name')!r}: its mimic"
-    if not element.get("joint"):
-        raise RobotError(f"{where} element names no joint")
-    return Mimic(
-        element.get("joint", ""),
-        finite_number(element.get("multiplier", "1"), f"{where} multiplier"),
-        finite_number(element.get("offset", "0"), f"{where} offset"),
-    )
 
 
 def _number(word: str | None) -> float:
@@ -339,24 +287,22 @@ def _looks(root: ET.Element) -> tuple[ET.Element, dict[str, tuple[str, ET.Elemen
     """
     small = ET.Element("robot", _head(root))
     shared = {material.get("name"): material for material in root.findall("material")}
-    small.extend(material for material in shared.values() if _has_color(material))
+    small.extend(filter(_has_color, shared.values()))
     looks = {}
     for link in root.findall("link"):
-        part = ET.SubElement(small, "link", {"name": link.get("name", "")})
-        for k, visual in enumerate(link.findall("visual")):
-            declared, mesh = visual.find("material"), visual.find("geometry/mesh")
-            material = declared if declared is None or len(declared) else shared.get(declared.get("name"), declared)
-            texture = None if material is None else material.find("texture")
-            plain = ET.SubElement(part, "visual", visual.attrib)
-            for child in visual:
-                if child is declared and not (material is not None and _has_color(material)):
-                    continue
-                if child.tag == "geometry" and mesh is not None:
-                    ET.SubElement(ET.SubElement(plain, "geometry"), "sphere", radius="1")
-                else:
-                    plain.append(child)
-            image = "" if texture is None else texture.get("filename", "")
-            looks[f"{link.get('name', '')}_{k}"] = link.get("name", ""), mesh, image
+        name = link.get("name", "")
+        part = ET.SubElement(small, "link", name=name)
+        part.extend(copy.deepcopy(link.findall("visual")))
+        for k, visual in enumerate(part):
+            material, mesh, texture = visual.find("material"), visual.find("geometry/mesh"), None
+            if material is not None:
+                meant = material if len(material) else shared.get(material.get("name"), material)
+                texture = meant.find("texture")
+                if not _has_color(meant):
+                    visual.remove(material)
+            if mesh is not None:
+                visual.findall("geometry")[0][:] = [ET.Element("sphere", radius="1")]
+            looks[f"{name}_{k}"] = name, mesh, "" if texture is None else texture.get("filename", "")
     small.extend(root.findall("joint"))
     return small, looks
 

@@ -4,17 +4,15 @@ import contextlib
 import importlib
 import io
 import logging
-import os
 import re
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 from xml.parsers import expat
 
-from varpin.errors import InputError, MissingDependency, RobotError
-from varpin.model.packages import LFS_POINTER, Packages
+from varpin.errors import InputError, RobotError
+from varpin.model.packages import Packages, content, optional
 
 logger = logging.getLogger(__name__)
 
@@ -51,26 +49,19 @@ def plain_name(path: Path) -> str:
     return Path(path.name.removesuffix(".xacro")).stem if is_xacro(path) else path.stem
 
 
-def expand(
-    path: Path,
-    arguments: Mapping[str, object],
-    package_dirs: Sequence[str] = (),
-    packages: Mapping[str, str] | None = None,
-    *,
-    strict: bool = True,
-) -> str:
-    """The XML to which a xacro file expands, with its arguments by name: strings, numbers or booleans.
+def expand(packages: Packages, arguments: Mapping[str, object], *, strict: bool = True) -> str:
+    """The XML to which the file of ``packages``, a xacro file, expands.
 
-    ``$(find package)`` is looked up in ``packages``, folders by name, around the file, and in ``package_dirs``. If
-    ``strict``, an argument that the file does not use is an error.
+    Its arguments, by name, are strings, numbers or booleans. If ``strict``, one that the file does not use is an error.
     """
-    xacro, substitution = _package(path)
-    if path.read_bytes().startswith(LFS_POINTER):
-        raise RobotError(f"{path} is a Git LFS pointer, not the file itself: git lfs pull downloads it")
+    path = packages.file
+    xacro = optional("xacro", f"the xacro file {path}", "xacro")
+    substitution = importlib.import_module("xacro.substitution_args")
+    content(path)
     words = {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in arguments.items()}
     given = _Arguments(words)
     notes = io.StringIO()
-    with _LOCK, contextlib.redirect_stderr(notes), _finding(substitution, path, package_dirs, packages or {}):
+    with _LOCK, contextlib.redirect_stderr(notes), _finding(substitution, packages):
         try:
             text = str(xacro.process_file(str(path), mappings=given).toxml())
         except Exception as error:  # Expressions in the file may raise anything.
@@ -92,13 +83,6 @@ def expand(
     return text
 
 
-def _package(path: Path) -> tuple[ModuleType, Any]:
-    try:
-        return importlib.import_module("xacro"), importlib.import_module("xacro.substitution_args")
-    except ModuleNotFoundError as error:
-        raise MissingDependency(f"the xacro file {path}", [str(error.name)], 'pip install "varpin[xacro]"') from None
-
-
 def _told(error: Exception) -> str:
     """What xacro says of an error, without names of Python classes."""
     if isinstance(error, expat.ExpatError):
@@ -109,20 +93,17 @@ def _told(error: Exception) -> str:
 
 
 @contextlib.contextmanager
-def _finding(substitution: Any, path: Path, package_dirs: Sequence[str], packages: Mapping[str, str]) -> Iterator[None]:
+def _finding(substitution: Any, packages: Packages) -> Iterator[None]:
     """Make xacro look packages up in the folders around the file first, and by ROS only after them."""
-    known = Packages(path, tuple(package_dirs))
     by_ros: Callable[[str], str] = substitution._eval_find
 
     def find(name: str) -> str:
-        if name in packages:
-            return packages[name]
-        if folder := known.folder(name):
+        if folder := packages.folder(name):
             return str(folder)
         try:
             return by_ros(name)
         except Exception:  # There is no ROS or no such package; the exception depends on the version of ROS.
-            looked = ", ".join(map(os.fspath, package_dirs)) or "no package_dirs"
+            looked = ", ".join(map(str, packages.places))
             raise substitution.SubstitutionException(
                 f"no package {name!r} above the file nor in {looked}; give the folder that holds it as package_dirs"
             ) from None

@@ -43,8 +43,8 @@ class KeepClear(PlanConstraint):
     """distance(q) >= distance for every pair, at every node after the first: links stay clear of obstacles.
 
     Each link is modelled by the smallest capsule around its shapes, which is larger than the link; ``capsules`` gives
-    others. Distances between capsules and spheres are exact; coal computes those of boxes and convex hulls. Derivatives
-    are those of the nearest points.
+    others. coal computes the distances, those between capsules and spheres exactly; derivatives are those of the
+    nearest points.
     """
 
     robot: Robot

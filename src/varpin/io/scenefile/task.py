@@ -27,7 +27,7 @@ from varpin.mechanics.scene import Scene, closest_controls, joints_with
 from varpin.model import Robot, combine, load_robot
 from varpin.model.clearance import Obstacle
 from varpin.model.inertia import Payload
-from varpin.model.tree import frame_index
+from varpin.model.tree import frame_of
 from varpin.simulation.start import on_constraints, time_steps
 from varpin.support.checks import count, flag
 
@@ -161,7 +161,7 @@ def _obstacle(where: Where, word: str, make: Callable[..., Obstacle], own: dict[
 def joints_of_frame(robot: Robot, frame: str) -> Mask:
     """Whether each coordinate (n,) moves a frame."""
     model, moving = robot.model, np.zeros(robot.dof, dtype=np.bool_)
-    for joint in model.supports[model.frames[frame_index(model, frame, robot.name)].parentJoint]:
+    for joint in model.supports[frame_of(model, frame, robot.name).parentJoint]:
         if joint > 0:
             moving[robot.tree.coordinate[joint - 1]] = True
     return moving

@@ -17,7 +17,7 @@ from varpin.errors import InputError
 from varpin.mechanics.constraints import Constraint, Distance, FrameOnFrame, PointOnLine, PointOnPlane, PointOnPoint
 from varpin.mechanics.forces import point_of
 from varpin.mechanics.scene import Scene
-from varpin.model.hull import hull_around
+from varpin.model.clearance import hull_around
 from varpin.model.kinematics import place_on_body
 from varpin.model.tree import place_of_frame, z_to
 from varpin.show.given import problem_of
@@ -264,14 +264,8 @@ def _regions(figure: Figure, constraints: Sequence[PlanConstraint], begin: float
     # Several constraints may share an obstacle.
     bodies = {repr(body): body for c in constraints if isinstance(c, kinds.KeepClear) for body in c.obstacles}
     for body in bodies.values():
-        if body.hull is not None:
-            points = body.hull.points
-        elif body.sides is not None:
-            points = corners_of(0.5 * np.array([-body.sides, body.sides]))
-        else:
-            points = np.array([body.begin, body.end]) - body.begin
         shifts = body.shifts(times) if body.shift is not None else np.zeros((1, 3))
-        yield _solid("obstacle", body.name, points @ body.rotation.T, body.radius, body.begin + shifts)
+        yield _solid("obstacle", body.name, body.points @ body.rotation.T, body.radius, body.position + shifts)
     for c in constraints:
         if isinstance(c, kinds.KeepInSphere | kinds.KeepOutOfSphere):
             centers = c.shifts(times) if callable(c.center) else c.shifts(times)[:1]

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from pinocchio.visualize.meshcat_visualizer import MeshcatVisualizer
 
 from varpin.arrays import Floats
-from varpin.model.hull import Hull
+from varpin.model.clearance import Hull
 from varpin.model.meshes import MeshPart, joined
 from varpin.model.tree import z_to
 from varpin.show.replay.picture import Shape
