@@ -187,8 +187,8 @@ def calls():
     yield "begin under constraints", constrained(closed).begin, {"q": draw(P, n), "v": draw(P, n)}
     yield "kick under constraints", constrained(closed, begun=True).kick, {"impulse": draw(P, n)}
     moved = vp.Scene(own.robot, constraints=vp.KinematicInput(own.robot.joint_names[0], "cubic"))
-    again = {"steps": core.Steps(**steps(moved)), "rates": draw(N, 1), "places": lobatto_places(2)}
-    yield "derivatives under constraints", core.constrained_derivatives, again
+    again = {"rates": draw(N, 1), "places": lobatto_places(2)}
+    yield "derivatives under constraints", core.Steps(**steps(moved)).derivatives, again
     yield "rate", dynamics.rate, {"x": draw(2 * n), "force": draw(n)}
     yield "node", dynamics.node, {"x": draw(2 * n)}
     yield "links", core.Links.make, links

@@ -10,7 +10,6 @@ NB_MODULE(_core, m) {
     varpin::border::register_explicit(m);
     varpin::border::register_backward(m);
     varpin::border::register_rollouts(m);
-    varpin::border::register_constrained(m);
     varpin::border::register_checks(m);
     varpin::border::register_costs(m);
     varpin::border::register_filter(m);

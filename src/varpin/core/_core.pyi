@@ -194,13 +194,19 @@ class Steps:
         """Raises ValueError for arrays that do not fit each other."""
 
     def derivatives(
-        self, ramp: bool = False, external: bool = False, parameters: Parameters | None = None
-    ) -> tuple[Floats, Floats, Floats, Floats, int, int]:
+        self,
+        ramp: bool = False,
+        external: bool = False,
+        parameters: Parameters | None = None,
+        places: Floats | None = None,
+        rates: Floats | None = None,
+    ) -> tuple[Floats, Floats, Floats, Floats, Floats, int, int]:
         """Derivatives of steps, the outcome, and the number of steps done.
 
-        They are those of (q1, p1) in (q0, p0) (N, 2n, 2n), in a constant force f (N, 2n, n), and with ``ramp`` in one
-        that grows linearly from 0 at the start of a step to f at its end (N, 2n, n), else (N, 2n, 0), and in k
-        parameters (N, 2n, k). ``external``: f is not the force of the controls, which drives limit, but acts beside it.
+        They are those of (q1, p1) in (q0, p0) (N, 2n, 2n), in a constant force f (N, 2n, n), with ``ramp`` in one that
+        grows linearly from 0 at the start of a step to f at its end (N, 2n, n), in the rates (N, i) of driven joints
+        (N, 2n, i), and in k parameters (N, 2n, k); what is not asked for has no columns. Under constraints there are
+        ``places`` and ``rates``. ``external``: f is not the force of the controls, which drives limit, but acts beside.
         """
 
     def curvatures(self, z: Floats) -> tuple[Floats, int, int]:
@@ -208,20 +214,6 @@ class Steps:
 
     def ends(self) -> tuple[Floats, Floats, int, int]:
         """Configurations and velocities (N, n) at the end of each step, the outcome, and the number of steps done."""
-
-def constrained_derivatives(
-    steps: Steps,
-    *,
-    places: Floats,
-    rates: Floats,
-    ramp: bool = False,
-    external: bool = False,
-    parameters: Parameters | None = None,
-) -> tuple[Floats, Floats, Floats, Floats, int, int]:
-    """Derivatives as of :meth:`Steps.derivatives`; the third are those in the rates (N, i) of driven joints (N, 2n, i).
-
-    With ``ramp`` those in the force are those in the one that grows.
-    """
 
 class Squares:
     """N functions (1/2) |L z + r|^2 + c . z: root L (N, z, z) or (1, z, z), shift r and linear c (N, z)."""
