@@ -1,4 +1,4 @@
-// Forward dynamics and the explicit methods.
+// Forward dynamics, the explicit methods, and the error of a finished motion.
 #include "varpin/explicit.hpp"
 
 #include <nanobind/stl/optional.h>
@@ -14,6 +14,7 @@
 #include "arrays.hpp"
 #include "rollout_arrays.hpp"
 #include "units.hpp"
+#include "varpin/clearance.hpp"
 
 namespace varpin::border {
 
@@ -44,11 +45,6 @@ struct BoundRollout {
     }
 };
 
-void require_rows(const Mechanism& mechanism, const In<2>& q, const In<2>& v, const In<2>& force) {
-    const auto n = static_cast<std::size_t>(mechanism.dof());
-    require_each({q.shape(0), n}, "q", q, "v", v, "force", force);
-}
-
 // The rate (v, a) of x = (q, v) under a force, and whether the mass matrix is positive definite.
 std::tuple<Out, bool> rate(BoundDynamics& dynamics, In<1> x, In<1> force) {
     const auto n = static_cast<std::size_t>(dynamics.core.dof());
@@ -74,8 +70,7 @@ std::tuple<Out, double, bool> node(BoundDynamics& dynamics, In<1> x) {
 // Accelerations (N, n) at each row of q, v and force (N, n), and their derivatives in each, (N, n, n); how many rows
 // went before one with a mass matrix that is not positive definite.
 std::tuple<Out, Out, Out, Out, std::size_t> accelerations(const Mechanism& mechanism, In<2> q, In<2> v, In<2> force) {
-    require_rows(mechanism, q, v, force);
-    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
+    const auto [n, rows] = rows_of(mechanism, "q", q, "v", v, "force", force);
     const Out values = array_for({rows, n}), aq = array_for({rows, n, n}), av = array_for({rows, n, n}),
               af = array_for({rows, n, n});
     std::size_t s = 0;
@@ -94,8 +89,7 @@ std::tuple<Out, Out, Out, Out, std::size_t> accelerations(const Mechanism& mecha
 // The joint forces (N, n) that accelerations a need at each row of q, v and a (N, n), besides those without a
 // potential.
 Out inverse_dynamics(const Mechanism& mechanism, In<2> q, In<2> v, In<2> a) {
-    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
-    require_each({rows, n}, "q", q, "v", v, "a", a);
+    const auto [n, rows] = rows_of(mechanism, "q", q, "v", v, "a", a);
     const Out out = array_for({rows, n});
     nb::gil_scoped_release release;
     ForwardDynamics dynamics(mechanism, true);
@@ -151,6 +145,41 @@ void roll(BoundRollout& rollout, double dt, nb::handle commands, In<3> increment
                [&](const Commands& by, const Additions& more, const Nodes& to) { core.roll(dt, by, more, to); });
 }
 
+Stretch stretch_of(In<3> curves, In<3> sums, In<2> places) {
+    const std::size_t steps = sums.shape(1), points = sums.shape(2), all = places.shape(1);
+    if (steps == 0 || points < 2 || (points - 1) % steps != 0 || all % steps != 0)
+        throw std::invalid_argument("a stretch needs its nodes evenly among its points, and its steps the same stages");
+    require(curves, "curves", {2, points, 3 * (steps + 1)});
+    require(sums, "sums", {2, steps, points});
+    require(places, "places", {points, all});
+    return {
+        static_cast<int>(steps), static_cast<int>(points), static_cast<int>(all / steps), copied(curves), copied(sums),
+        copied(places)};
+}
+
+Out propagated_errors(const Mechanism& mechanism, In<2> q, In<2> v, In<2> u, In<3> within, double dt,
+                      const Stretch& narrow, const Stretch* wide, bool damped, In<1> most_q, In<1> most_v) {
+    const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
+    const std::size_t steps = u.shape(0), stages = within.shape(1);
+    require_each({steps + 1, n}, "q", q, "v", v);
+    require_each({n}, "most_q", most_q, "most_v", most_v);
+    require(u, "u", {steps, m});
+    require(within, "within", {steps, stages, m});
+    if (!(dt > 0.0)) throw std::invalid_argument("dt must be positive");
+    if (narrow.steps != 1 || (wide && wide->steps != 2))
+        throw std::invalid_argument("narrow and wide must be stretches of one step and of two");
+    if (static_cast<std::size_t>(narrow.stages) != stages || (wide && wide->stages != narrow.stages))
+        throw std::invalid_argument("narrow and wide must have the stages of the controls");
+    std::vector<double> found;
+    {
+        nb::gil_scoped_release release;
+        const Record record{static_cast<std::int64_t>(steps), q.data(), v.data(), u.data(), dt};
+        Clearance clearance(mechanism, record, stages > 0 ? within.data() : nullptr, narrow, wide, damped);
+        found = clearance.errors(most_q.data(), most_v.data());
+    }
+    return array_of(found.data(), {n});
+}
+
 }  // namespace
 
 void register_explicit(nb::module_& m) {
@@ -184,6 +213,9 @@ void register_explicit(nb::module_& m) {
     m.def("inverse_dynamics", &inverse_dynamics, "mechanism"_a, "q"_a, "v"_a, "a"_a);
     m.def("linearize_explicit", &linearize, "mechanism"_a, "method"_a, "dt"_a, "q"_a, "v"_a, "force"_a,
           "ramp"_a = false);
+    nb::class_<Stretch>(m, "Stretch").def_static("make", &stretch_of, nb::kw_only(), "curves"_a, "sums"_a, "places"_a);
+    m.def("propagated_errors", &propagated_errors, "mechanism"_a, "q"_a, "v"_a, "u"_a, "within"_a, "dt"_a,
+          nb::kw_only(), "narrow"_a, "wide"_a.none(), "damped"_a, "most_q"_a, "most_v"_a);
 }
 
 }  // namespace varpin::border

@@ -29,11 +29,9 @@ std::unique_ptr<StepLinearization> constrained_linearization(const StepsAt& at, 
 
 // Of each unit.
 void register_mechanism(nanobind::module_& m);
-void register_kinematics(nanobind::module_& m);
 void register_explicit(nanobind::module_& m);
 void register_backward(nanobind::module_& m);
 void register_rollouts(nanobind::module_& m);
-void register_checks(nanobind::module_& m);
 void register_costs(nanobind::module_& m);
 void register_filter(nanobind::module_& m);
 

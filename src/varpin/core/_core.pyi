@@ -6,7 +6,7 @@ from enum import Enum, IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.core.arrays import Commands, ConstraintRows, FilterLog, RolloutArrays
+from varpin.core.arrays import Commands, ConstraintRows, Diffusion, FilterLog, RolloutArrays, Tree
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -20,35 +20,15 @@ class Mechanism:
 
     @staticmethod
     def make(
+        tree: Tree,
         *,
-        parent: Integers,
-        prismatic: Integers,
-        rotation: Floats,
-        translation: Floats,
-        mass: Floats,
-        center: Floats,
-        inertia: Floats,
-        coordinate: Integers,
-        ratio: Floats,
-        offset: Floats,
-        origin: Integers,
-        loads: Integers,
-        carried: Integers,
-        periodic: Integers,
-        armature: Floats,
-        group: Integers,
-        groups: int,
-        ends: Integers,
         gravity: Floats,
         forces: Sequence[tuple[str, int, tuple[float, ...]]],
         couplings: Sequence[tuple[str, int, int, tuple[float, ...]]],
         constraints: ConstraintRows,
         custom: Callable[[Floats, Floats, bool], tuple[Floats, Floats, Floats]] | None,
         actuation: Floats,
-        constant: Floats,
-        control: Floats,
-        quadratic: Floats,
-        centers: Floats,
+        diffusion: Diffusion,
     ) -> Mechanism:
         """Raises ValueError for arrays that do not fit each other or describe no tree."""
 
@@ -294,19 +274,7 @@ class Links:
     """Some bodies of a tree with all their ancestors; see src/core/include/varpin/kinematics.hpp."""
 
     @staticmethod
-    def make(
-        *,
-        parent: Integers,
-        prismatic: Integers,
-        rotation: Floats,
-        translation: Floats,
-        coordinate: Integers,
-        ratio: Floats,
-        offset: Floats,
-        mass: Floats,
-        center: Floats,
-        dof: int,
-    ) -> Links:
+    def make(tree: Tree) -> Links:
         """Raises ValueError for arrays that do not fit each other or describe no tree."""
 
     def place_frame(self, turned: Floats, shifted: Floats, q: Floats, jacobian: bool) -> tuple[Floats, Floats, Floats]:

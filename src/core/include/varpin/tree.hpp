@@ -45,8 +45,8 @@ struct Tree {
     std::vector<char> periodic;    // (n) whether the Lagrangian without elements is periodic in a whole turn
     std::vector<int> group;        // (n) mechanically independent group of a coordinate
     int groups = 0;
-    std::vector<Block> blocks;  // in order; they cover all coordinates
-    std::vector<LightPart> light_parts;
+    std::vector<Block> blocks{};  // in order; they cover all coordinates
+    std::vector<LightPart> light_parts{};
 
     int dof() const { return static_cast<int>(armature.size()); }
     int size() const { return static_cast<int>(bodies.size()); }
