@@ -2,13 +2,10 @@
 #include "varpin/explicit.hpp"
 
 #include <nanobind/stl/optional.h>
-#include <nanobind/stl/shared_ptr.h>
 #include <nanobind/stl/tuple.h>
 
-#include <memory>
 #include <optional>
 #include <tuple>
-#include <utility>
 #include <vector>
 
 #include "arrays.hpp"
@@ -22,48 +19,25 @@ namespace {
 
 using namespace nanobind::literals;
 
-using SharedMechanism = std::shared_ptr<Mechanism>;
-
-// What works on a mechanism, and keeps it alive.
-struct BoundDynamics {
-    BoundDynamics(SharedMechanism of) : mechanism(std::move(of)), core(*mechanism, false) {}
-
-    SharedMechanism mechanism;
-    ForwardDynamics core;
-};
-
-struct BoundRollout {
-    BoundRollout(SharedMechanism of, ExplicitMethod method, const In<2>& q, const In<2>& v)
-        : mechanism(std::move(of)),
-          core(*mechanism, method, static_cast<std::int64_t>(q.shape(0)), q.data(), v.data()) {}
-
-    SharedMechanism mechanism;
-    ExplicitRollout core;
-
-    Out view(std::vector<double>& values) const {
-        return Out(values.data(), {static_cast<std::size_t>(core.paths()), static_cast<std::size_t>(core.dof())});
-    }
-};
-
 // The rate (v, a) of x = (q, v) under a force, and whether the mass matrix is positive definite.
-std::tuple<Out, bool> rate(BoundDynamics& dynamics, In<1> x, In<1> force) {
-    const auto n = static_cast<std::size_t>(dynamics.core.dof());
+std::tuple<Out, bool> rate(ForwardDynamics& dynamics, In<1> x, In<1> force) {
+    const auto n = static_cast<std::size_t>(dynamics.dof());
     require(x, "x", {2 * n});
     require(force, "force", {n});
     const Out out = array_for({2 * n});
-    const bool regular = dynamics.core.at(x.data(), x.data() + n);
+    const bool regular = dynamics.at(x.data(), x.data() + n);
     std::copy(x.data() + n, x.data() + 2 * n, out.data());
-    dynamics.core.acceleration(force.data(), out.data() + n);
+    dynamics.acceleration(force.data(), out.data() + n);
     return {out, regular};
 }
 
 // Momentum and energy at x = (q, v), and whether the mass matrix is positive definite.
-std::tuple<Out, double, bool> node(BoundDynamics& dynamics, In<1> x) {
-    const auto n = static_cast<std::size_t>(dynamics.core.dof());
+std::tuple<Out, double, bool> node(ForwardDynamics& dynamics, In<1> x) {
+    const auto n = static_cast<std::size_t>(dynamics.dof());
     require(x, "x", {2 * n});
     const Out momentum = array_for({n});
-    const bool regular = dynamics.core.at(x.data(), x.data() + n);
-    const double energy = dynamics.core.energy(x.data() + n, momentum.data());
+    const bool regular = dynamics.at(x.data(), x.data() + n);
+    const double energy = dynamics.energy(x.data() + n, momentum.data());
     return {momentum, energy, regular};
 }
 
@@ -125,24 +99,27 @@ std::tuple<Out, Out, std::size_t> linearize(const Mechanism& mechanism, Explicit
     return {Jx, Jf, s};
 }
 
-BoundRollout rollout(SharedMechanism mechanism, ExplicitMethod method, In<2> q, In<2> v) {
-    const std::size_t n = static_cast<std::size_t>(mechanism->dof()), paths = q.shape(0);
-    require_each({paths, n}, "q", q, "v", v);
-    return BoundRollout(std::move(mechanism), method, q, v);
+ExplicitRollout rollout(const Mechanism& mechanism, ExplicitMethod method, In<2> q, In<2> v) {
+    const auto [n, paths] = rows_of(mechanism, "q", q, "v", v);
+    return {mechanism, method, static_cast<std::int64_t>(paths), q.data(), v.data()};
 }
 
-bool first_nodes(BoundRollout& rollout, nb::handle nodes) {
-    const Nodes to = nodes_of(*rollout.mechanism, nodes, static_cast<std::size_t>(rollout.core.paths()));
+// A view of the states of paths (P, n).
+Out view(const ExplicitRollout& rollout, std::vector<double>& values) {
+    return Out(values.data(), {static_cast<std::size_t>(rollout.paths()), static_cast<std::size_t>(rollout.dof())});
+}
+
+bool first_nodes(ExplicitRollout& rollout, nb::handle nodes) {
+    const Nodes to = nodes_of(rollout.mechanism(), nodes, static_cast<std::size_t>(rollout.paths()));
     if (to.steps < 1) throw std::invalid_argument("the nodes have no rows for the first nodes");
-    return rollout.core.first_nodes(to);
+    return rollout.first_nodes(to);
 }
 
-void roll(BoundRollout& rollout, double dt, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes,
+void roll(ExplicitRollout& rollout, double dt, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes,
           const std::optional<In<4>>& impulses) {
-    ExplicitRollout& core = rollout.core;
-    roll_paths(*rollout.mechanism, static_cast<std::size_t>(core.paths()), core.abscissae(), commands, increments,
-               drift, impulses, nodes,
-               [&](const Commands& by, const Additions& more, const Nodes& to) { core.roll(dt, by, more, to); });
+    roll_paths(rollout.mechanism(), static_cast<std::size_t>(rollout.paths()), rollout.abscissae(), commands,
+               increments, drift, impulses, nodes,
+               [&](const Commands& by, const Additions& more, const Nodes& to) { rollout.roll(dt, by, more, to); });
 }
 
 Stretch stretch_of(In<3> curves, In<3> sums, In<2> places) {
@@ -196,17 +173,20 @@ void register_explicit(nb::module_& m) {
         .value("euler", ExplicitMethod::euler)
         .value("semi_implicit", ExplicitMethod::semi_implicit)
         .value("runge_kutta", ExplicitMethod::runge_kutta);
-    nb::class_<BoundDynamics>(m, "ForwardDynamics")
-        .def(nb::init<SharedMechanism>(), "mechanism"_a)
+    nb::class_<ForwardDynamics>(m, "ForwardDynamics")
+        .def(
+            "__init__", [](ForwardDynamics* self, const Mechanism& of) { new (self) ForwardDynamics(of, false); },
+            "mechanism"_a, nb::keep_alive<1, 2>())
         .def("rate", &rate, "x"_a, "force"_a)
         .def("node", &node, "x"_a);
-    nb::class_<BoundRollout>(m, "ExplicitRollout")
-        .def_static("start", &rollout, "mechanism"_a, "method"_a, "q"_a, "v"_a)
+    nb::class_<ExplicitRollout>(m, "ExplicitRollout")
+        .def_static("start", &rollout, "mechanism"_a, "method"_a, "q"_a, "v"_a, nb::keep_alive<0, 1>())
         .def_prop_ro(
-            "q", [](BoundRollout& rollout) { return rollout.view(rollout.core.q); }, nb::rv_policy::reference_internal)
+            "q", [](ExplicitRollout& own) { return view(own, own.q); }, nb::rv_policy::reference_internal)
         .def_prop_ro(
-            "v", [](BoundRollout& rollout) { return rollout.view(rollout.core.v); }, nb::rv_policy::reference_internal)
-        .def("copy", [](const BoundRollout& rollout) { return BoundRollout(rollout); })
+            "v", [](ExplicitRollout& own) { return view(own, own.v); }, nb::rv_policy::reference_internal)
+        .def(
+            "copy", [](const ExplicitRollout& own) { return ExplicitRollout(own); }, nb::keep_alive<0, 1>())
         .def("first_nodes", &first_nodes, "nodes"_a)
         .def("roll", &roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a, "impulses"_a = nb::none());
     m.def("accelerations", &accelerations, "mechanism"_a, "q"_a, "v"_a, "force"_a);

@@ -24,7 +24,6 @@
 #include "varpin/jet.hpp"
 #include "varpin/kernels.hpp"
 #include "varpin/nodes.hpp"
-#include "varpin/size.hpp"
 #include "varpin/tableau.hpp"
 
 namespace varpin {
@@ -164,7 +163,7 @@ class Collocation {
 
     // `factor` for the matrices in the stages' jets.
     bool factor_blocks(double h) {
-        if (stages == 1) return kernels.factor(*this, h);
+        if (stages == 1) return (this->*kernels.factor)(h);
         double* matrix = lu.data();
         int* rows = order.data();
         for (const Block& block : blocks_of(mechanism.tree, n)) {
@@ -180,7 +179,7 @@ class Collocation {
     // x with N x = right (s, n), from the factors of `factor`.
     void solve_factored(const double* right, double* x) {
         if (eliminated()) return elimination->solve(right, x);
-        if (stages == 1) return kernels.solve(*this, right, x);
+        if (stages == 1) return (this->*kernels.solve)(right, x);
         solve_blocks(right, x, [](const double* matrix, int size, const int* rows, double* b, double* y) {
             solve_lu_pivoting(matrix, size, rows, b, y);
         });
@@ -427,13 +426,15 @@ class Collocation {
 
     // r(V); returns its largest entry in rounding units of its terms.
     double residuals(double h, const Start& start) {
-        return stages == 1 ? kernels.residuals(*this, h, start) : residuals_of(n, stages, h, start);
+        return stages == 1 ? (this->*kernels.residuals)(h, start) : residuals_of<int, int>(h, start);
     }
 
     // The discrete Euler-Lagrange residual r_i(V) of each stage, (S1) and (C1), into `residual`; returns the largest in
     // rounding units.
     template <class Size, class Stages>
-    double residuals_of(Size n, Stages stages, double h, const Start& start) {
+    double residuals_of(double h, const Start& start) {
+        const Size n = this->n;
+        const Stages stages = this->stages;
         double worst = 0.0;
         for (int i = 0; i < stages; ++i) {
             const double* force = start.force_at(i);
@@ -466,7 +467,7 @@ class Collocation {
 
     // The block (s width, s width) of N, (C3).
     void assemble(double h, Block block, double* matrix) {
-        if (stages == 1) return assemble_one(n, h, block, matrix);
+        if (stages == 1) return assemble_one<int>(h, block, matrix);
         const int width = block.end - block.begin, size = stages * width;
         std::fill(matrix, matrix + size * size, 0.0);
         // Row r of the derivative of L_q + F at stage j in all of V, added to the rows of N in one long loop.
@@ -503,7 +504,8 @@ class Collocation {
 
     // `assemble` for a single stage, without sums over stages.
     template <class Size>
-    void assemble_one(Size n, double h, Block block, double* matrix) const {
+    void assemble_one(double h, Block block, double* matrix) const {
+        const Size n = this->n;
         const double ahead = h * tableau.a[0], behind = h * tableau.gradient[0];
         const double *M = stage[0].M.data(), *A = stage[0].A.data(), *Lqq = stage[0].Lqq.data();
         const bool elements = mechanism.forces.any();
@@ -517,6 +519,39 @@ class Collocation {
             if (coupled()) add_coupled_row(h, 0, 0, r, block, line + block.begin);
             for (int c = block.begin; c < block.end; ++c) line[c] += M[row + c];
         }
+    }
+
+    // `factor` for a single stage. On the desired branch, the symmetric part of N is positive definite.
+    template <class Size>
+    bool factor_one(double h) {
+        const Size n = this->n;
+        double* matrix = lu.data();
+        for (const Block& block : blocks_of(mechanism.tree, n)) {
+            const int width = block.end - block.begin;
+            assemble_one<Size>(h, block, matrix);
+            if (!factor_lu(matrix, width, {0, width})) return false;
+            matrix += width * width;
+        }
+        return true;
+    }
+
+    template <class Size>
+    void solve_one(const double* right, double* x) const {
+        const double* matrix = lu.data();
+        for (const Block& block : blocks_of(mechanism.tree, Size(n))) {
+            const int width = block.end - block.begin;
+            solve_lu(matrix, width, {0, width}, right + block.begin, x + block.begin);
+            matrix += width * width;
+        }
+    }
+
+    template <class Size>
+    double kinetic_size_of_one(const double* x) const {
+        const Size n = this->n;
+        double total = 0.0;
+        for (const Block& block : blocks_of(mechanism.tree, n))
+            total += tableau.b[0] * quadratic_form(stage[0].M.data(), n, block, x);
+        return total;
     }
 
     // The contribution of couplings to a row of N_im. Not inlined, since that would slow down steps without couplings.
@@ -535,7 +570,7 @@ class Collocation {
     // The square of x (s, n) in the metric of the kinetic energy, averaged over the step.
     double kinetic_size(const double* x) {
         if (eliminated()) return elimination->kinetic_size(x);
-        if (stages == 1) return kernels.kinetic_size(*this, x);
+        if (stages == 1) return (this->*kernels.kinetic_size)(x);
         double total = 0.0;
         for (int i = 0; i < stages; ++i) {
             for (const Block& block : blocks_of(mechanism.tree, n))
@@ -593,43 +628,5 @@ class Collocation {
         }
     }
 };
-
-template <class Size>
-double Sized<Size>::residuals(Collocation& step, double h, const Start& start) {
-    return step.residuals_of(Size(step.n), Known<1>(1), h, start);
-}
-
-// On the desired branch, the symmetric part of N is positive definite.
-template <class Size>
-bool Sized<Size>::factor(Collocation& step, double h) {
-    const Size n = step.n;
-    double* matrix = step.lu.data();
-    for (const Block& block : blocks_of(step.mechanism.tree, n)) {
-        const int width = block.end - block.begin;
-        step.assemble_one(n, h, block, matrix);
-        if (!factor_lu(matrix, width, {0, width})) return false;
-        matrix += width * width;
-    }
-    return true;
-}
-
-template <class Size>
-void Sized<Size>::solve(const Collocation& step, const double* right, double* x) {
-    const double* matrix = step.lu.data();
-    for (const Block& block : blocks_of(step.mechanism.tree, Size(step.n))) {
-        const int width = block.end - block.begin;
-        solve_lu(matrix, width, {0, width}, right + block.begin, x + block.begin);
-        matrix += width * width;
-    }
-}
-
-template <class Size>
-double Sized<Size>::kinetic_size(const Collocation& step, const double* x) {
-    const Size n = step.n;
-    double total = 0.0;
-    for (const Block& block : blocks_of(step.mechanism.tree, n))
-        total += step.tableau.b[0] * quadratic_form(step.stage[0].M.data(), n, block, x);
-    return total;
-}
 
 }  // namespace varpin

@@ -2,6 +2,7 @@
 // docs/mathematics.md, "The Lagrangian jet".
 #pragma once
 
+#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <limits>
@@ -51,5 +52,26 @@ struct Tree {
     int dof() const { return static_cast<int>(armature.size()); }
     int size() const { return static_cast<int>(bodies.size()); }
 };
+
+// A size known at compile time, in the place of an int: the compiler unrolls loops, with the same code. docs/core.md,
+// "Processors".
+template <int count>
+struct Known {
+    constexpr Known(int) {}
+    constexpr operator int() const { return count; }
+};
+
+// Bodies and blocks of a tree of n coordinates. With n known at compile time, each body has a coordinate of its own,
+// and all coordinates form one block.
+inline int bodies_of(const Tree& tree, int) { return tree.size(); }
+inline const std::vector<Block>& blocks_of(const Tree& tree, int) { return tree.blocks; }
+template <int n>
+constexpr int bodies_of(const Tree&, Known<n>) {
+    return n;
+}
+template <int n>
+constexpr std::array<Block, 1> blocks_of(const Tree&, Known<n>) {
+    return {Block{0, n}};
+}
 
 }  // namespace varpin

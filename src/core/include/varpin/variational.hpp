@@ -98,7 +98,7 @@ inline void record_node(const PathState& state, int n, const Nodes& nodes, std::
     nodes.quality[3 * row + 2] = state.energies.defect();
 }
 
-// With the kernels of a number of joints, the mechanism has to be an arm of so many in a single block (size.hpp).
+// With the kernels of a number of joints, the mechanism has to be an arm of so many in a single block (tree.hpp).
 class VariationalStepper {
   public:
     VariationalStepper(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
