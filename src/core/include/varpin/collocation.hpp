@@ -208,6 +208,7 @@ class Collocation {
     }
 
     static constexpr int most_corrections = 10;
+    static constexpr bool bordered = false;
     // Of shortened corrections: how often they begin, how many there are each time, and how short they may be.
     static constexpr int most_approaches = 4;
     static constexpr int most_shortened = 40;
@@ -229,43 +230,59 @@ class Collocation {
     std::vector<double> element_curvature;  // (n) of the elements' potentials, if there is an elimination
     std::vector<double> diagonal;           // (n) of N, without the contributions of bodies in an elimination
 
-    Outcome iterate(double h, const Start& start, double tolerance, bool jets_wanted, Effort& effort) {
-        double before = infinity, worst = infinity;
+    // Newton's method, as in `solve`, on this equation or on one that borders it with constraints: their impulses may
+    // be far from the root where the velocities are not.
+    template <class Equation>
+    static Outcome newton(Equation& equation, double h, const Start& start, double tolerance, bool jets_wanted,
+                          Effort& effort) {
+        double before = infinity, worst = infinity, worst_before = infinity;
         bool fresh = true;
-        for (int iteration = 0; iteration < most_corrections + 2; ++iteration) {
-            sweep(h, start, fresh, effort);
-            worst = residuals(h, start);
-            const bool first = iteration == 0 && !jets_wanted && worst > 0.0;
+        for (int iteration = 0; iteration < Equation::most_corrections + 2; ++iteration) {
+            worst = equation.evaluate(h, start, fresh, effort);
+            const bool first = !Equation::bordered && iteration == 0 && !jets_wanted && worst > 0.0;
             if (worst <= tolerance && !first) {
                 if (fresh || !jets_wanted) break;
                 fresh = true;
                 continue;
             }
             if (!(worst < infinity)) return Outcome::not_finite;
-            if (fresh && !factor(h)) return Outcome::fold;
-            solve_factored(residual.data(), delta.data());
-            const double size = kinetic_size(delta.data());
-            if (iteration >= most_corrections) break;
-            if (!(size <= 0.25 * before)) {
+            if (iteration >= Equation::most_corrections) break;
+            if (fresh && !equation.factor(h)) return Outcome::fold;
+            const double size = equation.correct();
+            if (!(size <= 0.25 * before) && !(Equation::bordered && worst <= 0.25 * worst_before)) {
                 // The factors may be the cause, if they are from another iterate.
                 if (fresh) break;
                 fresh = true;
                 continue;
             }
-            take_correction();
+            equation.take_correction();
             ++effort.newton_iterations;
-            const double contraction = contraction_of(before, size);
-            if (!jets_wanted && certainly_last(h, fresh, contraction, tolerance, worst)) {
-                correct_forces(h);
-                break;
-            }
+            worst_before = worst;
+            // The factor by which corrections shrink.
+            const double contraction = before < infinity ? std::sqrt(size / before) : infinity;
+            if (!jets_wanted && equation.settles(h, start, fresh, contraction, tolerance, worst)) break;
             fresh = before < infinity && !(worst * contraction * contraction * contraction <= tolerance);
             before = size;
         }
         if (!(worst <= std::max(stagnation, tolerance))) return Outcome::diverged;
-        if (jets_wanted && eliminated()) write_jets();
         effort.residual = std::max(effort.residual, worst);
         return Outcome::solved;
+    }
+
+    Outcome iterate(double h, const Start& start, double tolerance, bool jets_wanted, Effort& effort) {
+        const Outcome outcome = newton(*this, h, start, tolerance, jets_wanted, effort);
+        if (outcome == Outcome::solved && jets_wanted && eliminated()) write_jets();
+        return outcome;
+    }
+
+    double evaluate(double h, const Start& start, bool fresh, Effort& effort) {
+        sweep(h, start, fresh, effort);
+        return residuals(h, start);
+    }
+
+    double correct() {
+        solve_factored(residual.data(), delta.data());
+        return kinetic_size(delta.data());
     }
 
     // Corrections with fresh factors, each shortened until the one after it, with the same factors, is smaller (natural
@@ -273,18 +290,15 @@ class Collocation {
     Outcome approach(double h, const Start& start, Effort& effort) {
         double share = 1.0;
         for (int iteration = 0; iteration < most_shortened; ++iteration) {
-            sweep(h, start, true, effort);
-            if (!(residuals(h, start) < infinity)) return Outcome::not_finite;
+            if (!(evaluate(h, start, true, effort) < infinity)) return Outcome::not_finite;
             if (!factor(h)) return Outcome::fold;
-            solve_factored(residual.data(), delta.data());
+            const double size = correct();
             ++effort.newton_iterations;
-            const double size = kinetic_size(delta.data());
             from = V;
             for (share = std::min(1.0, 4.0 * share);; share *= 0.5) {
                 if (share < least_share) return Outcome::diverged;
                 for (int k = 0; k < stages * n; ++k) V[k] = from[k] + share * delta[k];
-                sweep(h, start, false, effort);
-                residuals(h, start);
+                evaluate(h, start, false, effort);
                 solve_factored(residual.data(), next.data());
                 const double left = kinetic_size(next.data());
                 if (share == 1.0 && left <= 1e-4 * size) return Outcome::solved;
@@ -298,14 +312,9 @@ class Collocation {
         for (int k = 0; k < stages * n; ++k) V[k] += delta[k];
     }
 
-    // The factor by which corrections shrink, from the kinetic sizes of the last two; infinite after the first.
-    static double contraction_of(double before, double size) {
-        return before < infinity ? std::sqrt(size / before) : infinity;
-    }
-
     // Whether a correction needs no evaluation of the residual that it leaves, `worst` before it: by the nonlinearity
     // of the equation if its factors were `fresh`, or by the contraction. If so, `worst` becomes the estimate.
-    bool certainly_last(double h, bool fresh, double contraction, double tolerance, double& worst) {
+    bool settles(double h, const Start&, bool fresh, double contraction, double tolerance, double& worst) {
         const double left = fresh ? left_by_bending(h, worst) : infinity;
         if (fresh && (worst <= tolerance || sure * left <= tolerance)) {
             worst = std::min(worst, left);
@@ -314,6 +323,7 @@ class Collocation {
         } else {
             return false;
         }
+        correct_forces(h);
         return true;
     }
 

@@ -46,8 +46,7 @@ class ConstrainedLinearization : public StepLinearization {
 
     void differentiate(double h, double begin, double share, const StepDerivatives& to) override {
         swap(here, constrained.origin);
-        constrained.assemble(h);
-        factor_lu_pivoting(constrained.saddle.data(), stages * (n + here.rank()), constrained.rows.data());
+        constrained.factor(h);
         bend_points();
         state_columns(h);
         end_columns(h, to.state, to.force);
