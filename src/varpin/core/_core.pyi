@@ -195,12 +195,10 @@ class Steps:
     def ends(self) -> tuple[Floats, Floats, int, int]:
         """Configurations and velocities (N, n) at the end of each step, the outcome, and the number of steps done."""
 
-class Squares:
-    """N functions (1/2) |L z + r|^2 + c . z: root L (N, z, z) or (1, z, z), shift r and linear c (N, z)."""
+class BackwardPass:
+    """The recursion from the terminal cost's gradient (2n,) and Hessian (2n, 2n) in x."""
 
-    def __init__(self, root: Floats, shift: Floats, linear: Floats) -> None: ...
-
-class _Pass:
+    def __init__(self, controls: int, gradient: Floats, hessian: Floats) -> None: ...
     @property
     def slope(self) -> float:
         """Sum of Qu . k."""
@@ -212,7 +210,7 @@ class _Pass:
         """The cost of noise."""
     @property
     def loss(self) -> float:
-        """The largest relative rounding error of a pivot of Quu, or of its root."""
+        """The largest relative rounding error of a pivot of Quu."""
     def run(
         self,
         h: float,
@@ -231,26 +229,14 @@ class _Pass:
         control_gradient: Floats,
         spread: Floats,
         factors: Floats,
-        running: Squares = ...,
     ) -> int:
         """Pass over a block of N steps, the last block first; returns -1, or the decision without a minimum.
 
         Each control is held over ``hold`` steps, for R decisions. The linearized dynamics and the expanded costs are
-        described in src/core/include/varpin/steps.hpp; ``running``, of a :class:`RootPass` alone, has the costs of the
-        steps as squares. Written are the gains of u + k + K (x - x_nominal), ``feedforward`` (R, m) and ``feedback``
-        (R, m, 2n); ``control_gradient`` (R, m) of the cost; with noise ``spread`` (N, 2n, 2n), S; and ``factors``
-        (R, m, m), L D L' of the regularized Quu.
+        described in src/core/include/varpin/backward.hpp. Written are the gains of u + k + K (x - x_nominal),
+        ``feedforward`` (R, m) and ``feedback`` (R, m, 2n); ``control_gradient`` (R, m) of the cost; with noise
+        ``spread`` (N, 2n, 2n), S; and ``factors`` (R, m, m), L D L' of the regularized Quu.
         """
-
-class BackwardPass(_Pass):
-    """The recursion from the terminal cost's gradient (2n,) and Hessian (2n, 2n) in x."""
-
-    def __init__(self, controls: int, gradient: Floats, hessian: Floats) -> None: ...
-
-class RootPass(_Pass):
-    """:class:`BackwardPass` on square roots, from the terminal cost in x as squares, and its gradient (2n,)."""
-
-    def __init__(self, controls: int, terminal: Squares, gradient: Floats) -> None: ...
 
 def foresee(
     hold: int,
