@@ -91,6 +91,16 @@ bool foresee(int hold, In<3> A, In<3> B, In<2> feedforward, In<3> feedback, In<3
     return predict(plan, moves.data(), after.data());
 }
 
+// The first rows of a triangular form of `rows`.
+Out triangular(In<2> rows, int leading) {
+    const std::size_t columns = rows.shape(1), kept = static_cast<std::size_t>(leading);
+    if (leading < 0 || kept > std::min(rows.shape(0), columns))
+        throw std::invalid_argument("there are fewer rows or columns than are to be triangular");
+    std::vector<double> values = copied(rows);
+    triangularize(values.data(), static_cast<int>(rows.shape(0)), static_cast<int>(columns), leading);
+    return array_of(values.data(), {kept, columns});
+}
+
 }  // namespace
 
 void register_backward(nb::module_& m) {
@@ -105,6 +115,7 @@ void register_backward(nb::module_& m) {
         .def_prop_ro("loss", [](const BackwardPass& pass) { return pass.found.loss; });
     m.def("foresee", &foresee, "hold"_a, "A"_a, "B"_a, "feedforward"_a, "feedback"_a, "slack"_a, "moves"_a.noconvert(),
           "after"_a.noconvert());
+    m.def("triangular", &triangular, "rows"_a, "leading"_a);
 }
 
 }  // namespace varpin::border

@@ -1,15 +1,18 @@
-"""The backward pass on a square root of the value's Hessian, where the plain recursion loses all digits."""
+"""The backward pass on a square root of the value's Hessian, where the plain recursion loses all digits: (O3)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dtrtrs
 
 from varpin.arrays import Floats
 from varpin.control.sizes import ROUNDING
+from varpin.core import triangular
 from varpin.support.frozen import Frozen
+
+EPSILON = float(np.finfo(float).eps)  # of rounding, relative
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,43 +90,48 @@ class RootPass:
         running: Squares,
     ) -> int:
         """As :meth:`varpin.core.BackwardPass.run`, with the ``running`` cost as squares."""
-        m, x = self.m, self.x
+        m, x, N = self.m, self.x, len(A)
         order = np.r_[x : x + m, :x]  # from (x, u) to (u, x)
-        for s in range(len(A) - 1, -1, -1):
-            step = np.zeros((m + x, m + x))
-            step[m:] = np.hstack([B[s], A[s]])
-            held = (s + 1) % hold != 0
-            step[:m, :m] = np.eye(m) * held
-            root, rest = running.root[s % len(running.root)][:, order], running.shift[s][:, None]
-            stack = [np.hstack([self.rows[:, :-1] @ step, self.rows[:, -1:]]), np.sqrt(h) * np.hstack([root, rest])]
-            linear = self.linear @ step + h * running.linear[s][order]
-            costate = self.costate @ step + h * gradient[s][order]
-            if G.shape[2]:
-                kicked = _triangular(np.sqrt(h) * self.rows[:, m:-1], x)[:x]
+        J = np.concatenate([B, A], axis=2)
+        sizes, gradient, linear = np.abs(J), h * gradient[:, order], h * running.linear[:, order]
+        roots = np.broadcast_to(running.root[:, :, order], (N, m + x, m + x))
+        costs = np.sqrt(h) * np.concatenate([roots, running.shift[:, :, None]], axis=2)
+        jumps, turns = G.transpose(0, 2, 1), np.concatenate([Gu, Gx], axis=3).transpose(0, 2, 1, 3)
+        for s in range(N - 1, -1, -1):
+            before = self.rows
+            rows = np.concatenate([np.empty_like(before), costs[s]])
+            carried = rows[: len(before)]
+            np.matmul(before[:, m:-1], J[s], out=carried[:, :-1])
+            carried[:, -1] = before[:, -1]
+            cost, costate = self.linear[m:] @ J[s] + linear[s], self.costate[m:] @ J[s] + gradient[s]
+            scale = self.scale[m:] @ sizes[s]
+            if (s + 1) % hold:
+                carried[:, :m] += before[:, :m]
+                cost[:m] += self.linear[:m]
+                costate[:m] += self.costate[:m]
+                scale[:m] = np.hypot(scale[:m], self.scale[:m])
+            if jumps.shape[1]:
+                kicked = triangular(np.sqrt(h) * before[:, m:-1], x)
                 spread[s] = kicked.T @ kicked
-                for w in range(G.shape[2]):
-                    jump, turned = kicked @ G[s, :, w], kicked @ np.hstack([Gu[s, :, w], Gx[s, :, w]])
-                    self.noise += 0.5 * float(jump @ jump)
-                    if turned.any():
-                        stack.append(np.hstack([turned, jump[:, None]]))
-                        costate = costate + jump @ turned
-            scale = self.scale[m:] @ np.abs(step[m:])
-            scale[:m] = np.hypot(scale[:m], held * self.scale[:m])
-            self.linear, self.costate, self.scale = linear, costate, scale
-            rows = np.vstack(stack)
-            self.rows = _triangular(rows, m + x)[: m + x]
+                jump, turned = jumps[s] @ kicked.T, kicked @ turns[s]
+                self.noise += 0.5 * float((jump * jump).sum())
+                costate += np.einsum("wi,wic->c", jump, turned)
+                rows = np.concatenate([rows, *np.concatenate([turned, jump[:, :, None]], axis=2)])
+            self.linear, self.costate, self.scale = cost, costate, scale
+            self.rows = triangular(rows, m + x)
             if s % hold:
                 continue
-            r = s // hold
-            norms = np.linalg.norm(rows[:, :-1], axis=0)
+            r, norms = s // hold, np.sqrt(np.einsum("ij,ij->j", rows, rows))[:-1]
             firm = self._firm(norms[:m], regularization)
             if firm is None:
                 return r
-            control_gradient[r] = costate[:m]
-            pivots = np.diagonal(firm)
-            factors[r] = np.tril((firm[:, :m] / pivots[:, None]).T, -1) + np.diag(pivots**2)
+            control_gradient[r], factors[r] = costate[:m], firm[:, :m]
             feedforward[r], feedback[r] = self._decide(firm)
             self.scale = np.concatenate([np.zeros(m), norms[m:]])
+        # L D L' of R'R.
+        pivots = np.diagonal(factors, axis1=1, axis2=2).copy()
+        factors[:] = np.swapaxes(factors / pivots[:, :, None], 1, 2)
+        factors[:, range(m), range(m)] = pivots**2
         return -1
 
     def _firm(self, norms: Floats, regularization: float) -> Floats | None:
@@ -133,18 +141,19 @@ class RootPass:
         """
         m, rows = self.m, self.rows
         largest = norms.max(initial=0.0)
-        if not (np.isfinite(rows).all() and largest > 0.0):
+        if not (np.isfinite(rows.sum()) and largest > 0.0):
             return None
-        idle = (norms == 0.0) & (self._slope() == 0.0)
-        weight = np.where(idle, largest, np.sqrt(regularization) * norms)
-        firm = rows[:m]
-        if weight.any():
-            firm = _triangular(np.vstack([firm, np.eye(m, rows.shape[1]) * weight[:, None]]), m)[:m]
-        pivots = np.abs(np.diagonal(firm))
-        if not (pivots > 0.0).all():
+        firm, known = rows[:m], np.ones(m)
+        if regularization > 0.0 or norms.min() == 0.0:
+            idle = (norms == 0.0) & (self._slope() == 0.0)
+            weight, known = np.where(idle, largest, np.sqrt(regularization) * norms), np.where(idle, 0.0, 1.0)
+            if weight.any():
+                firm = triangular(np.vstack([firm, np.eye(m, rows.shape[1]) * weight[:, None]]), m)
+        pivots = np.abs(firm.diagonal())
+        if not pivots.min() > 0.0:
             return None
-        lost = np.finfo(float).eps * np.maximum(self.scale[:m], norms) / pivots
-        self.loss = max(self.loss, float(lost[~idle].max(initial=0.0)))
+        lost = known * np.maximum(self.scale[:m], norms) / pivots
+        self.loss = max(self.loss, EPSILON * float(lost.max()))
         return firm
 
     def _slope(self) -> Floats:
@@ -156,8 +165,8 @@ class RootPass:
     def _decide(self, firm: Floats) -> tuple[Floats, Floats]:
         """Feedforward (m,) and gains (m, x) of R_uu (k, K) = -(r_u + R_uu'^-1 c_u, R_ux), and the value under them."""
         m, rows, slope = self.m, self.rows, self._slope()
-        forced = solve_triangular(firm[:, :m], self.linear[:m], trans=1)
-        both = -solve_triangular(firm[:, :m], np.column_stack([firm[:, m:-1], firm[:, -1] + forced]))
+        forced = dtrtrs(firm[:, :m], self.linear[:m], trans=1)[0]
+        both = -dtrtrs(firm[:, :m], np.column_stack([firm[:, m:-1], firm[:, -1] + forced]))[0]
         K, k = both[:, :-1], both[:, -1]
         moved = rows[:m, :m] @ k
         self.slope += float(slope @ k)
@@ -168,29 +177,3 @@ class RootPass:
         self.linear[m:] += K.T @ self.linear[:m]
         self.linear[:m] = self.costate[:m] = 0.0
         return k, K
-
-
-def _triangular(rows: Floats, leading: int) -> Floats:
-    """``rows`` (r, c) with their first ``leading`` columns made triangular by reflections.
-
-    The row with the largest entry in a column is the pivot row. Otherwise a large row with a zero there would destroy
-    digits of small rows (Powell and Reid, "On applying Householder transformations to linear least squares problems",
-    1969).
-    """
-    rows = rows.copy()
-    for k in range(leading):
-        best = k + int(np.argmax(np.abs(rows[k:, k])))
-        largest = abs(rows[best, k])
-        if not largest > 0.0:
-            continue
-        rows[[k, best]] = rows[[best, k]]
-        along = rows[k:, k].copy()
-        norm = largest * np.linalg.norm(along / largest)
-        end = -norm if along[0] > 0.0 else norm
-        # The vector of the reflection, scaled by its first entry, is (1, w) with length^2 = 2 norm / (norm + |a_kk|).
-        factor = (norm + largest) / norm
-        along = np.append(1.0, along[1:] / (along[0] - end))
-        rows[k:, k + 1 :] -= np.outer(along, factor * (along @ rows[k:, k + 1 :]))
-        rows[k:, k] = 0.0
-        rows[k, k] = end
-    return rows

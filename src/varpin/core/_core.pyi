@@ -238,6 +238,9 @@ class BackwardPass:
         ``spread`` (N, 2n, 2n), S; and ``factors`` (R, m, m), L D L' of the regularized Quu.
         """
 
+def triangular(rows: Floats, leading: int) -> Floats:
+    """The first rows (leading, c) of R in rows (r, c) = Q R, triangular in as many columns."""
+
 def foresee(
     hold: int,
     A: Floats,
