@@ -140,7 +140,7 @@ class Rollout:
         """The constraint row that was closest to dependence on the others at the end of a path."""
 
 class Parameters:
-    """Parameters of a mechanism; see src/core/include/varpin/sensitivities.hpp.
+    """Parameters of a mechanism; see src/core/include/varpin/repeated_steps.hpp.
 
     Each is a pair of mechanisms, above and below it, and their ``distance`` (k,). ``gears`` (k, 2, n) are the factors
     by which forces of controls are greater there.

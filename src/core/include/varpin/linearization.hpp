@@ -139,11 +139,7 @@ class VariationalLinearization : public StepLinearization {
     }
 
     Outcome root_from(const RepeatedStep& at, const double* V) {
-        for (int i = 0; i < n; ++i) {
-            state.position[i] = {{at.q[i], 0.0}, 0.0};
-            stepper->unwind(i, state);
-            state.p[i] = {at.p[i], 0.0};
-        }
+        stepper->place(at.q, at.p, state);
         stepper->take_force(at.force, varies);
         return solve(at.h, V, state.position, state.p);
     }

@@ -174,6 +174,17 @@ class VariationalStepper {
         if (rates) take_rates(rates);
     }
 
+    // Put a path at (q, p).
+    void place(const double* q, const double* p, PathState& state) const {
+        for (int i = 0; i < n; ++i) {
+            state.position[i] = {{q[i], 0.0}, 0.0};
+            unwind(i, state);
+            state.q[i] = q[i];
+            state.p[i] = {p[i], 0.0};
+            state.momentum[i] = p[i];
+        }
+    }
+
     // Move a path to (q, p); false where M(q) is not positive definite. Its past stays, for guesses.
     bool move_to(const double* q, const double* p, PathState& state) {
         place(q, p, state);
@@ -284,16 +295,6 @@ class VariationalStepper {
           m(rows),
           stages(tableau.stages),
           trial(n) {}
-
-    void place(const double* q, const double* p, PathState& state) const {
-        for (int i = 0; i < n; ++i) {
-            state.position[i] = {{q[i], 0.0}, 0.0};
-            unwind(i, state);
-            state.q[i] = q[i];
-            state.p[i] = {p[i], 0.0};
-            state.momentum[i] = p[i];
-        }
-    }
 
     // What differs under constraints.
 
