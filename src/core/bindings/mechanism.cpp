@@ -95,23 +95,15 @@ CoupledElement coupling_of(const std::string& name, int a, int b, const std::vec
     });
 }
 
-// By the name of each kind of element: how many numbers it has, whether it has a potential, and a force without one.
-std::map<std::string, std::tuple<std::size_t, bool, bool>> element_kinds() {
+// By the name of each kind of force: how many numbers it has besides its points, whether it has a potential, and a
+// force without one.
+template <class Variant>
+std::map<std::string, std::tuple<std::size_t, bool, bool>> kinds_of() {
     std::map<std::string, std::tuple<std::size_t, bool, bool>> found;
-    each_kind(std::type_identity<Element>{}, [&](auto element) {
-        const bool potential = requires { element.potential(0.0); };
-        const bool force = requires { element.force(0.0, 0.0); } || requires { element.force(0.0, 0.0, 0.0); };
-        found[element.name] = {numbers_of<decltype(element)>(), potential, force};
-    });
-    return found;
-}
-
-// The same of couplings, without the numbers of their points.
-std::map<std::string, std::tuple<std::size_t, bool, bool>> coupling_kinds() {
-    std::map<std::string, std::tuple<std::size_t, bool, bool>> found;
-    each_kind(std::type_identity<CoupledElement>{}, [&](auto coupling) {
-        const bool potential = requires { coupling.potential(Vec3<double>{}); };
-        found[coupling.name] = {numbers_of<decltype(coupling)>(), potential, !potential};
+    each_kind(std::type_identity<Variant>{}, [&](auto kind) {
+        const bool potential = requires { kind.potential(0.0); } || requires { kind.potential(Vec3<double>{}); };
+        const bool force = !potential || requires { kind.force(0.0, 0.0); };
+        found[kind.name] = {numbers_of<decltype(kind)>(), potential, force};
     });
     return found;
 }
@@ -427,8 +419,8 @@ std::tuple<Out, Out> constraint_curvature(const Mechanism& mechanism, In<1> q, I
 }  // namespace
 
 void register_mechanism(nb::module_& m) {
-    m.def("element_kinds", &element_kinds);
-    m.def("coupling_kinds", &coupling_kinds);
+    m.def("element_kinds", &kinds_of<Element>);
+    m.def("coupling_kinds", &kinds_of<CoupledElement>);
     nb::class_<Mechanism>(m, "Mechanism")
         .def_static("make", &mechanism_of, "tree"_a, nb::kw_only(), "gravity"_a, "forces"_a, "couplings"_a,
                     "constraints"_a, "custom"_a.none(), "actuation"_a, "diffusion"_a)

@@ -50,6 +50,8 @@ struct Share {
 
 // The balance of a light part at a node; the carrier's L_q and L_v in all coordinates.
 struct PartLedger {
+    explicit PartLedger(int n) : Lq(n), Lv(n) {}
+
     double jacobi = 0.0;
     double potential = 0.0;
     double scale = 0.0;  // magnitude of their terms
@@ -60,12 +62,8 @@ struct PartLedger {
 
 // Energies of a path at its last node.
 struct Energies {
-    explicit Energies(const Tree& tree) : group(tree.groups), share(tree.dof()), part(tree.light_parts.size()) {
-        for (PartLedger& ledger : part) {
-            ledger.Lq.resize(tree.dof());
-            ledger.Lv.resize(tree.dof());
-        }
-    }
+    explicit Energies(const Tree& tree)
+        : group(tree.groups), share(tree.dof()), part(tree.light_parts.size(), PartLedger(tree.dof())) {}
     std::vector<Ledger> group;
     std::vector<Share> share;
     std::vector<PartLedger> part;
