@@ -12,8 +12,8 @@ from refusals import refused
 
 import varpin as vp
 from varpin import core
-from varpin.control.riccati import squares_of
 from varpin.control.sizes import HARMLESS
+from varpin.control.square_root import RootPass, squares_of
 
 H = 0.1  # the step
 INERTIAS = {"unit": np.ones(3), "finger": np.array([1e-5, 1e-6, 1e-7]), "mixed": np.array([1.0, 1e-3, 1e-6])}
@@ -55,8 +55,8 @@ def run_over(given, end_gradient, end_hessian, *, roots, hold=1, regularization=
     """(-1 or the decision without a minimum, what the pass filled in, the pass)."""
     m, gains, more = given["B"].shape[2], empty(given, hold), {}
     if roots:
-        run = core.RootPass(m, squares_of(end_gradient[None], end_hessian[None]).core, end_gradient)
-        more["running"] = squares_of(given["gradient"], given["hessian"]).core
+        run = RootPass(m, squares_of(end_gradient[None], end_hessian[None]), end_gradient)
+        more["running"] = squares_of(given["gradient"], given["hessian"])
     else:
         run = core.BackwardPass(m, end_gradient, end_hessian)
     return run.run(h, hold, regularization, **given, **gains, **more), gains, run

@@ -13,17 +13,13 @@ from refusals import refused
 
 import varpin as vp
 from varpin import core
-from varpin.core.arrays import Commands, ConstraintRows, RolloutArrays, new_nodes
+from varpin.core.arrays import Commands, ConstraintRows, Diffusion, RolloutArrays, Tree, new_nodes
 from varpin.integrators.tableau import gauss_coefficients, lobatto_places
 from varpin.signals.commands import interpolation, open_loop
 
 N, P = 4, 2
 NOISE = vp.AdditiveNoise(1e-3) + vp.ControlNoise(0.1) + vp.StateNoise(0.1)
-TREE = (
-    "parent", "prismatic", "rotation", "translation", "mass", "center", "inertia", "coordinate", "ratio", "offset",
-    "origin", "loads", "carried", "periodic", "armature", "group", "groups", "ends",
-)  # fmt: skip
-PLACES = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio", "offset", "mass", "center")
+OF_BODIES = Tree._fields[: Tree._fields.index("loads")]
 GUARDS = {"active": True, "branch_margin": 0.5, "energy_balance": 5e-3, "energy_budget": 0.02, "most_halvings": 12}
 
 
@@ -35,17 +31,29 @@ def scene():
     return vp.Scene(vp.load_robot("panda"), damping=0.1, noise=NOISE, actuation=draw(8, 3))
 
 
+def fields_of(prefix, record):
+    return {f"{prefix}.{name}": value for name, value in record._asdict().items()}
+
+
+def record(kind, prefix, parts):
+    return kind(**{name: parts[f"{prefix}.{name}"] for name in kind._fields})
+
+
 def of_mechanism(scene):
-    tree, fields = scene.robot.tree, scene.diffusion
     return {
-        **{name: getattr(tree, name) for name in TREE},
+        **fields_of("tree", scene.robot.tree),
+        **fields_of("diffusion", scene.diffusion),
         **{name: getattr(scene, name) for name in ("gravity", "actuation")},
         "forces": scene.elements,
         "couplings": scene.couplings,
         "constraints": scene.bound_constraints.rows,
         "custom": scene.custom,
-        **dict(zip(("constant", "control", "quadratic", "centers"), fields, strict=True)),
     }
+
+
+def mechanism(**parts):
+    others = {name: value for name, value in parts.items() if "." not in name}
+    return core.Mechanism.make(record(Tree, "tree", parts), diffusion=record(Diffusion, "diffusion", parts), **others)
 
 
 def of_tableau():
@@ -64,8 +72,8 @@ def of_roll(scene, feedback):
     commands = Commands(draw(N // 2, m), draw(rows, m, width), draw(rows, width), 2, limits, draw(P, m))
     nodes = new_nodes(P, N, n, m)
     return {
-        **{f"commands.{name}": value for name, value in commands._asdict().items()},
-        **{f"nodes.{name}": value for name, value in nodes._asdict().items()},
+        **fields_of("commands", commands),
+        **fields_of("nodes", nodes),
         "dt": 1e-3,
         "increments": 1e-2 * draw(P, N, k),
         "drift": draw(P, N, n),
@@ -74,10 +82,7 @@ def of_roll(scene, feedback):
 
 def roll(rollout):
     def call(dt, increments, drift, **parts):
-        commands, nodes = (
-            kind(**{name: parts[f"{prefix}.{name}"] for name in kind._fields})
-            for kind, prefix in ((Commands, "commands"), (RolloutArrays, "nodes"))
-        )
+        commands, nodes = record(Commands, "commands", parts), record(RolloutArrays, "nodes", parts)
         path = rollout.copy() if isinstance(rollout, core.ExplicitRollout) else rollout.fork(core.Guards.make(**GUARDS))
         path.roll(dt, commands, increments, drift, nodes)
         assert (nodes.done == N).all()
@@ -158,11 +163,10 @@ def calls():
     n, m = own.robot.dof, own.controls
     state, states = {"q": draw(n), "v": draw(n)}, {"q": draw(N, n), "v": draw(N, n)}
     tree = own.robot.tree
-    links = {name: getattr(tree, name) for name in PLACES} | {"dof": n}
-    made = core.Links.make(**links)
+    made = core.Links.make(tree)
     many = {**states, "force": draw(N, n)}
     dynamics = core.ForwardDynamics(own.core)
-    yield "mechanism", core.Mechanism.make, of_mechanism(own)
+    yield "mechanism", mechanism, of_mechanism(own)
     yield "jet", own.core.jet, state
     yield "jets", own.core.jets, states
     yield "jets along", own.core.jets_along, {**states, "alpha": draw(N, n), "beta": draw(N, n)}
@@ -187,11 +191,12 @@ def calls():
     yield "begin under constraints", constrained(closed).begin, {"q": draw(P, n), "v": draw(P, n)}
     yield "kick under constraints", constrained(closed, begun=True).kick, {"impulse": draw(P, n)}
     moved = vp.Scene(own.robot, constraints=vp.KinematicInput(own.robot.joint_names[0], "cubic"))
-    again = {"steps": core.Steps(**steps(moved)), "rates": draw(N, 1), "places": lobatto_places(2)}
-    yield "derivatives under constraints", core.constrained_derivatives, again
+    again = {"rates": draw(N, 1), "places": lobatto_places(2)}
+    yield "derivatives under constraints", core.Steps(**steps(moved)).derivatives, again
     yield "rate", dynamics.rate, {"x": draw(2 * n), "force": draw(n)}
     yield "node", dynamics.node, {"x": draw(2 * n)}
-    yield "links", core.Links.make, links
+    bodies = {name: getattr(tree, name) for name in OF_BODIES}
+    yield "links", lambda **parts: core.Links.make(tree._replace(**parts)), bodies
     frame = {"turned": np.eye(3), "shifted": draw(3), "q": draw(N, n), "jacobian": True}
     yield "place a frame", made.place_frame, frame
     yield "backward pass", backward, of_backward(n, m)
@@ -243,7 +248,7 @@ def with_rate(rate):
     own = vp.Scene(vp.planar_chain(1), constraints=vp.KinematicInput("joint1"))
     rows = own.bound_constraints.rows
     rows = rows._replace(ties=tuple(tie._replace(rate=rate) for tie in rows.ties))
-    return core.Mechanism.make(**of_mechanism(own) | {"constraints": rows})
+    return mechanism(**of_mechanism(own) | {"constraints": rows})
 
 
 def with_level(level):
@@ -302,9 +307,9 @@ def test_two_threads_in_forks_of_one_rollout_are_refused():
 )
 def test_what_is_no_tree_is_refused(field, value, facts):
     own = of_mechanism(vp.Scene(vp.planar_chain(2)))
-    own[field] = np.array(value, dtype=np.asarray(own[field]).dtype)
+    own[f"tree.{field}"] = np.array(value, dtype=np.asarray(own[f"tree.{field}"]).dtype)
     with refused(ValueError, facts):
-        core.Mechanism.make(**own)
+        mechanism(**own)
 
 
 def sliding():
@@ -365,10 +370,17 @@ def test_matrices_beyond_the_range_of_indices_are_refused_before_there_is_room_f
     )}  # fmt: skip
     own |= {"parent": np.arange(-1, n - 1), "coordinate": np.arange(n), "origin": np.repeat([1, 0], [1, n - 1])}
     own |= {"loads": np.zeros(0, dtype=np.int64), "carried": np.zeros((0, n), dtype=np.int64), "ends": np.array([n])}
-    own |= {"actuation": np.zeros((n, 0)), "constant": np.zeros((n, 0)), "control": np.zeros((n, 0, 0))}
-    own |= {"quadratic": np.zeros((n, 0)), "centers": np.zeros((n, 0))}
-    own |= {"forces": [], "couplings": [], "constraints": ConstraintRows(), "custom": None}
-    chain = core.Mechanism.make(**own, groups=1, gravity=np.zeros(3))
+    none = np.zeros((n, 0))
+    chain = core.Mechanism.make(
+        Tree(**own, groups=1),
+        gravity=np.zeros(3),
+        forces=[],
+        couplings=[],
+        constraints=ConstraintRows(),
+        custom=None,
+        actuation=none,
+        diffusion=Diffusion(none, np.zeros((n, 0, 0)), none, none),
+    )
     still = np.zeros((1, n))
     step = (vp.Midpoint()._tableau(), 0.5, vp.Midpoint()._guards())
     assert core.Rollout(chain, *step, 1.0, 1).begin(still, still)

@@ -113,8 +113,13 @@ bool linearize(const Motion& motion, Vector& A, Vector& B) {
         const std::int64_t parts = motion.tally[4 * s + 3];
         const std::span halvings(next, parts > 1 ? parts : 0);
         next += halvings.size();
-        const varpin::Outcome outcome = linearization.first(h, q, motion.p_before(s), guess.data(), force.data(),
-                                                            halvings, &A[s * x * x], by_force.data());
+        const varpin::Outcome outcome = linearization.first({.h = h,
+                                                             .q = q,
+                                                             .p = motion.p_before(s),
+                                                             .force = force.data(),
+                                                             .guess = guess.data(),
+                                                             .halvings = halvings},
+                                                            {.state = &A[s * x * x], .force = by_force.data()});
         if (outcome != varpin::Outcome::solved) return false;
         for (int i = 0; i < x; ++i) {
             double* row = &B[(s * x + i) * m];

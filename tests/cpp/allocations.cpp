@@ -115,8 +115,14 @@ bool allocates_nothing(const varpin::Mechanism& mechanism) {
         double guess[n];
         for (int s = 1; s < N; ++s) {
             for (int i = 0; i < n; ++i) guess[i] = (q[s * n + i] - q[(s - 1) * n + i]) / h;
-            const varpin::Outcome outcome = linearization.first(h, &q[(s - 1) * n], &p[(s - 1) * n], guess, &u[s * n],
-                                                                halvings, &A[s * 4 * n * n], &B[s * 2 * n * n]);
+            const varpin::RepeatedStep step{.h = h,
+                                            .q = &q[(s - 1) * n],
+                                            .p = &p[(s - 1) * n],
+                                            .force = &u[s * n],
+                                            .guess = guess,
+                                            .halvings = halvings};
+            const varpin::StepDerivatives to{.state = &A[s * 4 * n * n], .force = &B[s * 2 * n * n]};
+            const varpin::Outcome outcome = linearization.first(step, to);
             if (outcome != varpin::Outcome::solved) return false;
         }
         return true;

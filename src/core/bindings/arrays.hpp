@@ -58,6 +58,40 @@ void require_each(std::initializer_list<std::size_t> shape, const char* name, co
     require_each(shape, more...);
 }
 
+// An array of a named tuple. It is never converted: its owner sees what is written to it, and keeps it.
+template <class Array>
+Array field(nb::handle record, const char* name) {
+    Array array;
+    if (!nb::try_cast(record.attr(name), array, false))
+        throw nb::type_error((std::string(name) + " is no contiguous array of the right kind").c_str());
+    return array;
+}
+
+// Its numbers, of this shape.
+template <class Array>
+auto field(nb::handle record, const char* name, std::initializer_list<std::size_t> shape) {
+    const Array array = field<Array>(record, name);
+    require(array, name, shape);
+    return array.data();
+}
+
+// The same of an array that may be left out, empty along its first axis; null then.
+template <class Array>
+auto optional_field(nb::handle record, const char* name, std::initializer_list<std::size_t> shape) {
+    return field<Array>(record, name).shape(0) == 0 ? nullptr : field<Array>(record, name, shape);
+}
+
+// The numbers n of coordinates and N of rows of arrays (N, n), names and arrays in turn.
+struct Rows {
+    std::size_t n, N;
+};
+template <class Model, class... More>
+Rows rows_of(const Model& model, const char* name, const In<2>& first, const More&... more) {
+    const Rows rows{static_cast<std::size_t>(model.dof()), first.shape(0)};
+    require_each({rows.N, rows.n}, name, first, more...);
+    return rows;
+}
+
 // A NumPy array of zeros, to be filled in.
 inline Out array_for(std::initializer_list<std::size_t> shape) {
     std::size_t size = 1;

@@ -1,10 +1,8 @@
-// Backward passes: on the Hessian of the value, and on its square root.
+// The backward pass, and what its plan foresees.
 #include "varpin/backward.hpp"
 
 #include "arrays.hpp"
 #include "units.hpp"
-#include "varpin/square_root.hpp"
-#include "varpin/steps.hpp"
 
 namespace varpin::border {
 
@@ -27,36 +25,10 @@ void make_pass(BackwardPass* self, int controls, In<1> gradient, In<2> hessian) 
     new (self) BackwardPass(static_cast<int>(x / 2), controls, gradient.data(), hessian.data());
 }
 
-// Squares with references to their arrays.
-struct HeldSquares {
-    HeldSquares(In<3> root_, In<2> shift_, In<2> linear_) : root(root_), shift(shift_), linear(linear_) {
-        const std::size_t N = shift.shape(0), z = shift.shape(1);
-        require(root, "root", {root.shape(0) == 1 ? 1 : N, z, z});
-        require(linear, "linear", {N, z});
-    }
-
-    // Views, after a check that there are `count` functions of `size` variables.
-    Squares fitting(const char* name, std::size_t count, std::size_t size) const {
-        require(shift, name, {count, size});
-        return {.root = root.data(), .one_root = root.shape(0) == 1, .shift = shift.data(), .linear = linear.data()};
-    }
-
-    In<3> root;
-    In<2> shift, linear;
-};
-
-void make_root_pass(RootPass* self, int controls, const HeldSquares& terminal, In<1> gradient) {
-    const std::size_t x = gradient.shape(0);
-    if (x % 2 != 0) throw std::invalid_argument("gradient has an odd size");
-    if (controls < 0) throw std::invalid_argument("controls must not be negative");
-    new (self) RootPass(static_cast<int>(x / 2), controls, terminal.fitting("terminal", 1, x), gradient.data());
-}
-
-// A pass over steps, whose gains are written to arrays; see steps.hpp. `running` are the costs of a RootPass.
-template <class Pass, class... Running>
-std::ptrdiff_t run(Pass& pass, double h, int hold, double regularization, In<3> A, In<3> B, In<3> G, In<4> Gx, In<4> Gu,
-                   In<2> gradient, In<3> hessian, InOut<2> feedforward, InOut<3> feedback, InOut<2> control_gradient,
-                   InOut<3> spread, InOut<3> factors, const Running&... running) {
+// A pass over steps, whose gains are written to arrays; see ExpandedSteps and Gains.
+std::ptrdiff_t run(BackwardPass& pass, double h, int hold, double regularization, In<3> A, In<3> B, In<3> G, In<4> Gx,
+                   In<4> Gu, In<2> gradient, In<3> hessian, InOut<2> feedforward, InOut<3> feedback,
+                   InOut<2> control_gradient, InOut<3> spread, InOut<3> factors) {
     const std::size_t N = A.shape(0), x = A.shape(1), m = B.shape(2), k = G.shape(2), size = x + m;
     const std::size_t R = decisions_of(N, hold);
     if (x != 2 * static_cast<std::size_t>(pass.dof()) || m != static_cast<std::size_t>(pass.controls()))
@@ -91,11 +63,8 @@ std::ptrdiff_t run(Pass& pass, double h, int hold, double regularization, In<3> 
                       .control_gradient = control_gradient.data(),
                       .spread = spread.data(),
                       .factors = factors.data()};
-    const auto each = [&](const auto&... costs) {
-        nb::gil_scoped_release release;
-        return pass.run(h, hold, regularization, steps, costs..., gains);
-    };
-    return each(running.fitting("running", N, size)...);
+    nb::gil_scoped_release release;
+    return pass.run(h, hold, regularization, steps, gains);
 }
 
 // The changes of the controls, moves (R, m), and the states after each step, after (N, 2n), of a linearized motion
@@ -122,30 +91,31 @@ bool foresee(int hold, In<3> A, In<3> B, In<2> feedforward, In<3> feedback, In<3
     return predict(plan, moves.data(), after.data());
 }
 
-// The members of a pass; `more` are arguments of its run beside the common ones.
-template <class Pass, class Run, class... More>
-void define(nb::class_<Pass>& type, Run run, More... more) {
-    type.def("run", run, "h"_a, "hold"_a, "regularization"_a, nb::kw_only(), "A"_a, "B"_a, "G"_a, "Gx"_a, "Gu"_a,
-             "gradient"_a, "hessian"_a, "feedforward"_a.noconvert(), "feedback"_a.noconvert(),
-             "control_gradient"_a.noconvert(), "spread"_a.noconvert(), "factors"_a.noconvert(), more...)
-        .def_prop_ro("slope", [](const Pass& pass) { return pass.found.slope; })
-        .def_prop_ro("curvature", [](const Pass& pass) { return pass.found.curvature; })
-        .def_prop_ro("noise", [](const Pass& pass) { return pass.found.noise; })
-        .def_prop_ro("loss", [](const Pass& pass) { return pass.found.loss; });
+// The first rows of a triangular form of `rows`.
+Out triangular(In<2> rows, int leading) {
+    const std::size_t columns = rows.shape(1), kept = static_cast<std::size_t>(leading);
+    if (leading < 0 || kept > std::min(rows.shape(0), columns))
+        throw std::invalid_argument("there are fewer rows or columns than are to be triangular");
+    std::vector<double> values = copied(rows);
+    triangularize(values.data(), static_cast<int>(rows.shape(0)), static_cast<int>(columns), leading);
+    return array_of(values.data(), {kept, columns});
 }
 
 }  // namespace
 
 void register_backward(nb::module_& m) {
-    nb::class_<HeldSquares>(m, "Squares").def(nb::init<In<3>, In<2>, In<2>>(), "root"_a, "shift"_a, "linear"_a);
-    auto pass = nb::class_<BackwardPass>(m, "BackwardPass");
-    pass.def("__init__", &make_pass, "controls"_a, "gradient"_a, "hessian"_a);
-    define(pass, &run<BackwardPass>);
-    auto root_pass = nb::class_<RootPass>(m, "RootPass");
-    root_pass.def("__init__", &make_root_pass, "controls"_a, "terminal"_a, "gradient"_a);
-    define(root_pass, &run<RootPass, HeldSquares>, "running"_a);
+    nb::class_<BackwardPass>(m, "BackwardPass")
+        .def("__init__", &make_pass, "controls"_a, "gradient"_a, "hessian"_a)
+        .def("run", &run, "h"_a, "hold"_a, "regularization"_a, nb::kw_only(), "A"_a, "B"_a, "G"_a, "Gx"_a, "Gu"_a,
+             "gradient"_a, "hessian"_a, "feedforward"_a.noconvert(), "feedback"_a.noconvert(),
+             "control_gradient"_a.noconvert(), "spread"_a.noconvert(), "factors"_a.noconvert())
+        .def_prop_ro("slope", [](const BackwardPass& pass) { return pass.found.slope; })
+        .def_prop_ro("curvature", [](const BackwardPass& pass) { return pass.found.curvature; })
+        .def_prop_ro("noise", [](const BackwardPass& pass) { return pass.found.noise; })
+        .def_prop_ro("loss", [](const BackwardPass& pass) { return pass.found.loss; });
     m.def("foresee", &foresee, "hold"_a, "A"_a, "B"_a, "feedforward"_a, "feedback"_a, "slack"_a, "moves"_a.noconvert(),
           "after"_a.noconvert());
+    m.def("triangular", &triangular, "rows"_a, "leading"_a);
 }
 
 }  // namespace varpin::border

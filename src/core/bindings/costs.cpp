@@ -1,4 +1,4 @@
-// Costs at samples and of changes of controls.
+// Placements of frames for many configurations at once, and costs at samples.
 #include "varpin/costs.hpp"
 
 #include <nanobind/stl/tuple.h>
@@ -16,6 +16,41 @@ namespace {
 
 using namespace nanobind::literals;
 
+Links links_of(nb::handle tree) {
+    const std::size_t n = field<In<1>>(tree, "armature").shape(0);
+    return {bodies_of(tree, n), static_cast<int>(n)};
+}
+
+// A frame with rotation `turned` and position `shifted` in a body.
+Placement placement_of(const In<2>& turned, const In<1>& shifted) {
+    require(turned, "turned", {3, 3});
+    require(shifted, "shifted", {3});
+    return {rotation_at(turned.data()), vector_at(shifted.data())};
+}
+
+// Rotations (N, 3, 3), positions (N, 3) and Jacobians (N, 6, n), (0, 6, n) if not wanted, of a frame with rotation
+// `turned` and position `shifted` in the last body.
+std::tuple<Out, Out, Out> place_frame(const Links& links, In<2> turned, In<1> shifted, In<2> q, bool jacobian) {
+    const std::size_t n = static_cast<std::size_t>(links.dof), rows = q.shape(0), count = links.bodies.size();
+    require(q, "q", {rows, n});
+    if (count == 0) throw std::invalid_argument("a frame needs at least one body");
+    const Out rotation = array_for({rows, 3, 3}), position = array_for({rows, 3}),
+              jacobians = array_for({jacobian ? rows : 0, 6, n});
+    {
+        nb::gil_scoped_release release;
+        const Placement offset = placement_of(turned, shifted);
+        std::vector<Placement> at(count);
+        for (std::size_t s = 0; s < rows; ++s) {
+            forward_kinematics(links, q.data() + s * n, at.data());
+            const Placement frame = at.back() * offset;
+            write(frame.rotation, rotation.data() + 9 * s);
+            write(frame.position, position.data() + 3 * s);
+            if (jacobian) frame_jacobian(links, at.data(), frame.position, jacobians.data() + 6 * n * s);
+        }
+    }
+    return {rotation, position, jacobians};
+}
+
 CostTerms terms_for(int dof, int controls) {
     if (dof < 0 || controls < 0)
         throw std::invalid_argument("numbers of coordinates and controls must not be negative");
@@ -23,12 +58,10 @@ CostTerms terms_for(int dof, int controls) {
 }
 
 std::size_t add_frame(CostTerms& costs, const Links& links, In<2> turned, In<1> shifted) {
-    require(turned, "turned", {3, 3});
-    require(shifted, "shifted", {3});
     if (links.bodies.empty()) throw std::invalid_argument("a frame needs at least one body");
     if (links.dof != costs.dof)
         throw std::invalid_argument("the frame has another number of coordinates than the costs");
-    costs.frames.push_back({links, {rotation_at(turned.data()), {shifted(0), shifted(1), shifted(2)}}});
+    costs.frames.push_back({links, placement_of(turned, shifted)});
     return costs.frames.size() - 1;
 }
 
@@ -62,12 +95,7 @@ void add_term(CostTerms& costs, Subject subject, int index, In<2> weight, In<2> 
         throw std::invalid_argument("only a manipulability has directions, at most one for each coordinate");
     for (int row : rows)
         if (row < 0 || row > 5) throw std::invalid_argument("directions must be rows of a Jacobian");
-    costs.terms.push_back({subject,
-                           static_cast<int>(size),
-                           index,
-                           {weight.data(), weight.data() + weight.size()},
-                           {target.data(), target.data() + target.size()},
-                           rows});
+    costs.terms.push_back({subject, static_cast<int>(size), index, copied(weight), copied(target), rows});
 }
 
 std::size_t rows_of(const CostTerms& costs, const In<2>& q, const In<2>& v, const In<2>& u) {
@@ -108,6 +136,9 @@ std::tuple<Out, Out> expand(const CostTerms& costs, In<2> q, In<2> v, In<2> u) {
 }  // namespace
 
 void register_costs(nb::module_& m) {
+    nb::class_<Links>(m, "Links")
+        .def_static("make", &links_of, "tree"_a)
+        .def("place_frame", &place_frame, "turned"_a, "shifted"_a, "q"_a, "jacobian"_a);
     nb::enum_<Subject>(m, "Subject")
         .value("entries", Subject::entries)
         .value("excess", Subject::excess)

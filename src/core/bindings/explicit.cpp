@@ -1,19 +1,17 @@
-// Forward dynamics and the explicit methods.
+// Forward dynamics, the explicit methods, and the error of a finished motion.
 #include "varpin/explicit.hpp"
 
 #include <nanobind/stl/optional.h>
-#include <nanobind/stl/shared_ptr.h>
 #include <nanobind/stl/tuple.h>
 
-#include <memory>
 #include <optional>
 #include <tuple>
-#include <utility>
 #include <vector>
 
 #include "arrays.hpp"
 #include "rollout_arrays.hpp"
 #include "units.hpp"
+#include "varpin/clearance.hpp"
 
 namespace varpin::border {
 
@@ -21,61 +19,32 @@ namespace {
 
 using namespace nanobind::literals;
 
-using SharedMechanism = std::shared_ptr<Mechanism>;
-
-// What works on a mechanism, and keeps it alive.
-struct BoundDynamics {
-    BoundDynamics(SharedMechanism of) : mechanism(std::move(of)), core(*mechanism, false) {}
-
-    SharedMechanism mechanism;
-    ForwardDynamics core;
-};
-
-struct BoundRollout {
-    BoundRollout(SharedMechanism of, ExplicitMethod method, const In<2>& q, const In<2>& v)
-        : mechanism(std::move(of)),
-          core(*mechanism, method, static_cast<std::int64_t>(q.shape(0)), q.data(), v.data()) {}
-
-    SharedMechanism mechanism;
-    ExplicitRollout core;
-
-    Out view(std::vector<double>& values) const {
-        return Out(values.data(), {static_cast<std::size_t>(core.paths()), static_cast<std::size_t>(core.dof())});
-    }
-};
-
-void require_rows(const Mechanism& mechanism, const In<2>& q, const In<2>& v, const In<2>& force) {
-    const auto n = static_cast<std::size_t>(mechanism.dof());
-    require_each({q.shape(0), n}, "q", q, "v", v, "force", force);
-}
-
 // The rate (v, a) of x = (q, v) under a force, and whether the mass matrix is positive definite.
-std::tuple<Out, bool> rate(BoundDynamics& dynamics, In<1> x, In<1> force) {
-    const auto n = static_cast<std::size_t>(dynamics.core.dof());
+std::tuple<Out, bool> rate(ForwardDynamics& dynamics, In<1> x, In<1> force) {
+    const auto n = static_cast<std::size_t>(dynamics.dof());
     require(x, "x", {2 * n});
     require(force, "force", {n});
     const Out out = array_for({2 * n});
-    const bool regular = dynamics.core.at(x.data(), x.data() + n);
+    const bool regular = dynamics.at(x.data(), x.data() + n);
     std::copy(x.data() + n, x.data() + 2 * n, out.data());
-    dynamics.core.acceleration(force.data(), out.data() + n);
+    dynamics.acceleration(force.data(), out.data() + n);
     return {out, regular};
 }
 
 // Momentum and energy at x = (q, v), and whether the mass matrix is positive definite.
-std::tuple<Out, double, bool> node(BoundDynamics& dynamics, In<1> x) {
-    const auto n = static_cast<std::size_t>(dynamics.core.dof());
+std::tuple<Out, double, bool> node(ForwardDynamics& dynamics, In<1> x) {
+    const auto n = static_cast<std::size_t>(dynamics.dof());
     require(x, "x", {2 * n});
     const Out momentum = array_for({n});
-    const bool regular = dynamics.core.at(x.data(), x.data() + n);
-    const double energy = dynamics.core.energy(x.data() + n, momentum.data());
+    const bool regular = dynamics.at(x.data(), x.data() + n);
+    const double energy = dynamics.energy(x.data() + n, momentum.data());
     return {momentum, energy, regular};
 }
 
 // Accelerations (N, n) at each row of q, v and force (N, n), and their derivatives in each, (N, n, n); how many rows
 // went before one with a mass matrix that is not positive definite.
 std::tuple<Out, Out, Out, Out, std::size_t> accelerations(const Mechanism& mechanism, In<2> q, In<2> v, In<2> force) {
-    require_rows(mechanism, q, v, force);
-    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
+    const auto [n, rows] = rows_of(mechanism, "q", q, "v", v, "force", force);
     const Out values = array_for({rows, n}), aq = array_for({rows, n, n}), av = array_for({rows, n, n}),
               af = array_for({rows, n, n});
     std::size_t s = 0;
@@ -94,8 +63,7 @@ std::tuple<Out, Out, Out, Out, std::size_t> accelerations(const Mechanism& mecha
 // The joint forces (N, n) that accelerations a need at each row of q, v and a (N, n), besides those without a
 // potential.
 Out inverse_dynamics(const Mechanism& mechanism, In<2> q, In<2> v, In<2> a) {
-    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
-    require_each({rows, n}, "q", q, "v", v, "a", a);
+    const auto [n, rows] = rows_of(mechanism, "q", q, "v", v, "a", a);
     const Out out = array_for({rows, n});
     nb::gil_scoped_release release;
     ForwardDynamics dynamics(mechanism, true);
@@ -131,24 +99,62 @@ std::tuple<Out, Out, std::size_t> linearize(const Mechanism& mechanism, Explicit
     return {Jx, Jf, s};
 }
 
-BoundRollout rollout(SharedMechanism mechanism, ExplicitMethod method, In<2> q, In<2> v) {
-    const std::size_t n = static_cast<std::size_t>(mechanism->dof()), paths = q.shape(0);
-    require_each({paths, n}, "q", q, "v", v);
-    return BoundRollout(std::move(mechanism), method, q, v);
+ExplicitRollout rollout(const Mechanism& mechanism, ExplicitMethod method, In<2> q, In<2> v) {
+    const auto [n, paths] = rows_of(mechanism, "q", q, "v", v);
+    return {mechanism, method, static_cast<std::int64_t>(paths), q.data(), v.data()};
 }
 
-bool first_nodes(BoundRollout& rollout, nb::handle nodes) {
-    const Nodes to = nodes_of(*rollout.mechanism, nodes, static_cast<std::size_t>(rollout.core.paths()));
+// A view of the states of paths (P, n).
+Out view(const ExplicitRollout& rollout, std::vector<double>& values) {
+    return Out(values.data(), {static_cast<std::size_t>(rollout.paths()), static_cast<std::size_t>(rollout.dof())});
+}
+
+bool first_nodes(ExplicitRollout& rollout, nb::handle nodes) {
+    const Nodes to = nodes_of(rollout.mechanism(), nodes, static_cast<std::size_t>(rollout.paths()));
     if (to.steps < 1) throw std::invalid_argument("the nodes have no rows for the first nodes");
-    return rollout.core.first_nodes(to);
+    return rollout.first_nodes(to);
 }
 
-void roll(BoundRollout& rollout, double dt, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes,
+void roll(ExplicitRollout& rollout, double dt, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes,
           const std::optional<In<4>>& impulses) {
-    ExplicitRollout& core = rollout.core;
-    roll_paths(*rollout.mechanism, static_cast<std::size_t>(core.paths()), core.abscissae(), commands, increments,
-               drift, impulses, nodes,
-               [&](const Commands& by, const Additions& more, const Nodes& to) { core.roll(dt, by, more, to); });
+    roll_paths(rollout.mechanism(), static_cast<std::size_t>(rollout.paths()), rollout.abscissae(), commands,
+               increments, drift, impulses, nodes,
+               [&](const Commands& by, const Additions& more, const Nodes& to) { rollout.roll(dt, by, more, to); });
+}
+
+Stretch stretch_of(In<3> curves, In<3> sums, In<2> places) {
+    const std::size_t steps = sums.shape(1), points = sums.shape(2), all = places.shape(1);
+    if (steps == 0 || points < 2 || (points - 1) % steps != 0 || all % steps != 0)
+        throw std::invalid_argument("a stretch needs its nodes evenly among its points, and its steps the same stages");
+    require(curves, "curves", {2, points, 3 * (steps + 1)});
+    require(sums, "sums", {2, steps, points});
+    require(places, "places", {points, all});
+    return {
+        static_cast<int>(steps), static_cast<int>(points), static_cast<int>(all / steps), copied(curves), copied(sums),
+        copied(places)};
+}
+
+Out propagated_errors(const Mechanism& mechanism, In<2> q, In<2> v, In<2> u, In<3> within, double dt,
+                      const Stretch& narrow, const Stretch* wide, bool damped, In<1> most_q, In<1> most_v) {
+    const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
+    const std::size_t steps = u.shape(0), stages = within.shape(1);
+    require_each({steps + 1, n}, "q", q, "v", v);
+    require_each({n}, "most_q", most_q, "most_v", most_v);
+    require(u, "u", {steps, m});
+    require(within, "within", {steps, stages, m});
+    if (!(dt > 0.0)) throw std::invalid_argument("dt must be positive");
+    if (narrow.steps != 1 || (wide && wide->steps != 2))
+        throw std::invalid_argument("narrow and wide must be stretches of one step and of two");
+    if (static_cast<std::size_t>(narrow.stages) != stages || (wide && wide->stages != narrow.stages))
+        throw std::invalid_argument("narrow and wide must have the stages of the controls");
+    std::vector<double> found;
+    {
+        nb::gil_scoped_release release;
+        const Record record{static_cast<std::int64_t>(steps), q.data(), v.data(), u.data(), dt};
+        Clearance clearance(mechanism, record, stages > 0 ? within.data() : nullptr, narrow, wide, damped);
+        found = clearance.errors(most_q.data(), most_v.data());
+    }
+    return array_of(found.data(), {n});
 }
 
 }  // namespace
@@ -167,23 +173,29 @@ void register_explicit(nb::module_& m) {
         .value("euler", ExplicitMethod::euler)
         .value("semi_implicit", ExplicitMethod::semi_implicit)
         .value("runge_kutta", ExplicitMethod::runge_kutta);
-    nb::class_<BoundDynamics>(m, "ForwardDynamics")
-        .def(nb::init<SharedMechanism>(), "mechanism"_a)
+    nb::class_<ForwardDynamics>(m, "ForwardDynamics")
+        .def(
+            "__init__", [](ForwardDynamics* self, const Mechanism& of) { new (self) ForwardDynamics(of, false); },
+            "mechanism"_a, nb::keep_alive<1, 2>())
         .def("rate", &rate, "x"_a, "force"_a)
         .def("node", &node, "x"_a);
-    nb::class_<BoundRollout>(m, "ExplicitRollout")
-        .def_static("start", &rollout, "mechanism"_a, "method"_a, "q"_a, "v"_a)
+    nb::class_<ExplicitRollout>(m, "ExplicitRollout")
+        .def_static("start", &rollout, "mechanism"_a, "method"_a, "q"_a, "v"_a, nb::keep_alive<0, 1>())
         .def_prop_ro(
-            "q", [](BoundRollout& rollout) { return rollout.view(rollout.core.q); }, nb::rv_policy::reference_internal)
+            "q", [](ExplicitRollout& own) { return view(own, own.q); }, nb::rv_policy::reference_internal)
         .def_prop_ro(
-            "v", [](BoundRollout& rollout) { return rollout.view(rollout.core.v); }, nb::rv_policy::reference_internal)
-        .def("copy", [](const BoundRollout& rollout) { return BoundRollout(rollout); })
+            "v", [](ExplicitRollout& own) { return view(own, own.v); }, nb::rv_policy::reference_internal)
+        .def(
+            "copy", [](const ExplicitRollout& own) { return ExplicitRollout(own); }, nb::keep_alive<0, 1>())
         .def("first_nodes", &first_nodes, "nodes"_a)
         .def("roll", &roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a, "impulses"_a = nb::none());
     m.def("accelerations", &accelerations, "mechanism"_a, "q"_a, "v"_a, "force"_a);
     m.def("inverse_dynamics", &inverse_dynamics, "mechanism"_a, "q"_a, "v"_a, "a"_a);
     m.def("linearize_explicit", &linearize, "mechanism"_a, "method"_a, "dt"_a, "q"_a, "v"_a, "force"_a,
           "ramp"_a = false);
+    nb::class_<Stretch>(m, "Stretch").def_static("make", &stretch_of, nb::kw_only(), "curves"_a, "sums"_a, "places"_a);
+    m.def("propagated_errors", &propagated_errors, "mechanism"_a, "q"_a, "v"_a, "u"_a, "within"_a, "dt"_a,
+          nb::kw_only(), "narrow"_a, "wide"_a.none(), "damped"_a, "most_q"_a, "most_v"_a);
 }
 
 }  // namespace varpin::border

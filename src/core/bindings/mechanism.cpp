@@ -95,23 +95,15 @@ CoupledElement coupling_of(const std::string& name, int a, int b, const std::vec
     });
 }
 
-// By the name of each kind of element: how many numbers it has, whether it has a potential, and a force without one.
-std::map<std::string, std::tuple<std::size_t, bool, bool>> element_kinds() {
+// By the name of each kind of force: how many numbers it has besides its points, whether it has a potential, and a
+// force without one.
+template <class Variant>
+std::map<std::string, std::tuple<std::size_t, bool, bool>> kinds_of() {
     std::map<std::string, std::tuple<std::size_t, bool, bool>> found;
-    each_kind(std::type_identity<Element>{}, [&](auto element) {
-        const bool potential = requires { element.potential(0.0); };
-        const bool force = requires { element.force(0.0, 0.0); } || requires { element.force(0.0, 0.0, 0.0); };
-        found[element.name] = {numbers_of<decltype(element)>(), potential, force};
-    });
-    return found;
-}
-
-// The same of couplings, without the numbers of their points.
-std::map<std::string, std::tuple<std::size_t, bool, bool>> coupling_kinds() {
-    std::map<std::string, std::tuple<std::size_t, bool, bool>> found;
-    each_kind(std::type_identity<CoupledElement>{}, [&](auto coupling) {
-        const bool potential = requires { coupling.potential(Vec3<double>{}); };
-        found[coupling.name] = {numbers_of<decltype(coupling)>(), potential, !potential};
+    each_kind(std::type_identity<Variant>{}, [&](auto kind) {
+        const bool potential = requires { kind.potential(0.0); } || requires { kind.potential(Vec3<double>{}); };
+        const bool force = !potential || requires { kind.force(0.0, 0.0); };
+        found[kind.name] = {numbers_of<decltype(kind)>(), potential, force};
     });
     return found;
 }
@@ -207,48 +199,55 @@ OuterForce outer_force_of(nb::object function, std::size_t n) {
     };
 }
 
-void describe_links(Tree& tree, const In<1>& mass, const In<2>& center, const In<2>& inertia,
-                    const Integers<1>& origin) {
-    for (std::size_t j = 0; j < tree.bodies.size(); ++j) {
-        Body& link = tree.bodies[j];
-        if (origin(j) == 0 && link.parent < 0) throw std::invalid_argument("a root must be an origin");
-        link.mass = mass(j);
-        link.center = {center(j, 0), center(j, 1), center(j, 2)};
-        link.inertia = {inertia(j, 0), inertia(j, 1), inertia(j, 2), inertia(j, 3), inertia(j, 4), inertia(j, 5)};
-        link.origin = origin(j) != 0;
-    }
-}
-
-void take_coordinates(Tree& tree, const Integers<1>& group, int groups, const Integers<1>& periodic) {
-    for (std::size_t c = 0; c < group.shape(0); ++c) {
-        if (group(c) < 0 || group(c) >= groups) throw std::invalid_argument("a coordinate's group is out of range");
-        tree.group.push_back(static_cast<int>(group(c)));
-        tree.periodic.push_back(periodic(c) != 0);
-    }
-    tree.groups = groups;
-}
-
-void take_blocks(Tree& tree, const Integers<1>& ends, int n) {
-    int begin = 0;
+// The tree of bodies, the Python named tuple Tree.
+Tree tree_of(nb::handle tree) {
+    const auto armature = field<In<1>>(tree, "armature");
+    const auto loads = field<Integers<1>>(tree, "loads"), ends = field<Integers<1>>(tree, "ends");
+    const std::size_t n = armature.shape(0);
+    const std::int64_t *group = field<Integers<1>>(tree, "group", {n}),
+                       *periodic = field<Integers<1>>(tree, "periodic", {n}),
+                       *carried = field<Integers<2>>(tree, "carried", {loads.shape(0), n});
+    Tree out{.bodies = bodies_of(tree, n),
+             .armature = copied(armature),
+             .periodic = {periodic, periodic + n},
+             .group = {group, group + n},
+             .groups = nb::cast<int>(tree.attr("groups"))};
+    for (const int own : out.group)
+        if (own < 0 || own >= out.groups) throw std::invalid_argument("a coordinate's group is out of range");
     for (std::size_t b = 0; b < ends.shape(0); ++b) {
-        if (ends(b) <= begin || ends(b) > n)
+        const int begin = b > 0 ? out.blocks.back().end : 0;
+        if (ends(b) <= begin || ends(b) > static_cast<std::int64_t>(n))
             throw std::invalid_argument("the ends of blocks must increase up to the number of coordinates");
-        tree.blocks.push_back({begin, static_cast<int>(ends(b))});
-        begin = static_cast<int>(ends(b));
+        out.blocks.push_back({begin, static_cast<int>(ends(b))});
     }
-    if (begin != n) throw std::invalid_argument("the last block must end with the last coordinate");
+    if ((out.blocks.empty() ? 0 : out.blocks.back().end) != static_cast<int>(n))
+        throw std::invalid_argument("the last block must end with the last coordinate");
+    for (std::size_t r = 0; r < loads.shape(0); ++r, carried += n) {
+        if (loads(r) < 0 || loads(r) >= static_cast<std::int64_t>(out.bodies.size()) || out.bodies[loads(r)].parent < 0)
+            throw std::invalid_argument("the first body of a light part must have a parent");
+        out.light_parts.push_back({static_cast<int>(loads(r)), {carried, carried + n}});
+    }
+    return out;
 }
 
-void take_light_parts(Tree& tree, const Integers<1>& loads, const Integers<2>& carried) {
-    for (std::size_t r = 0; r < loads.shape(0); ++r) {
-        if (loads(r) < 0 || loads(r) >= static_cast<std::int64_t>(tree.bodies.size()) ||
-            tree.bodies[loads(r)].parent < 0)
-            throw std::invalid_argument("the first body of a light part must have a parent");
-        LightPart part;
-        part.body = static_cast<int>(loads(r));
-        for (std::size_t c = 0; c < carried.shape(1); ++c) part.carried.push_back(carried(r, c) != 0);
-        tree.light_parts.push_back(part);
+// The diffusion fields of n coordinates and m controls, the Python named tuple Diffusion.
+Diffusion diffusion_of(nb::handle fields, std::size_t n, std::size_t m) {
+    const std::size_t k = field<In<2>>(fields, "constant").shape(1);
+    const auto numbers = [&](const double* from, std::size_t size) { return std::vector<double>(from, from + size); };
+    const auto entries = [&](const char* name) { return numbers(field<In<2>>(fields, name, {n, k}), n * k); };
+    Diffusion out{.processes = static_cast<int>(k),
+                  .constant = entries("constant"),
+                  .control = numbers(field<In<3>>(fields, "control", {n, k, m}), n * k * m),
+                  .quadratic = entries("quadratic"),
+                  .center = entries("center")};
+    for (std::size_t w = 0; w < k; ++w) {
+        bool depends = false;
+        for (std::size_t r = 0; r < n; ++r) {
+            for (std::size_t c = 0; c < m; ++c) depends = depends || out.control[(r * k + w) * m + c] != 0.0;
+        }
+        if (depends) out.sloped.push_back(static_cast<int>(w));
     }
+    return out;
 }
 
 Forces forces_of(const Named& forces, int n) {
@@ -270,34 +269,14 @@ Couplings couplings_of(const NamedCouplings& couplings, const std::vector<Body>&
     return {between, bodies};
 }
 
-Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation, In<2> translation, In<1> mass,
-                       In<2> center, In<2> inertia, Integers<1> coordinate, In<1> ratio, In<1> offset,
-                       Integers<1> origin, Integers<1> loads, Integers<2> carried, Integers<1> periodic, In<1> armature,
-                       Integers<1> group, int groups, Integers<1> ends, In<1> gravity, const Named& forces,
-                       const NamedCouplings& couplings, const NamedConstraints& constraints, nb::object custom,
-                       In<2> actuation, In<2> constant, In<3> control, In<2> quadratic, In<2> centers) {
-    const std::size_t bodies = parent.shape(0), n = armature.shape(0), m = actuation.shape(1);
-    const std::size_t processes = constant.shape(1);
-    require(origin, "origin", {bodies});
-    require(mass, "mass", {bodies});
-    require(center, "center", {bodies, 3});
-    require(inertia, "inertia", {bodies, 6});
-    require(carried, "carried", {loads.shape(0), n});
-    require_each({n}, "group", group, "periodic", periodic);
+Mechanism mechanism_of(nb::handle tree, In<1> gravity, const Named& forces, const NamedCouplings& couplings,
+                       const NamedConstraints& constraints, nb::object custom, In<2> actuation, nb::handle diffusion) {
+    Mechanism out;
+    out.tree = tree_of(tree);
+    const std::size_t n = out.tree.armature.size(), m = actuation.shape(1);
     require(gravity, "gravity", {3});
     require(actuation, "actuation", {n, m});
-    require(constant, "constant", {n, processes});
-    require(control, "control", {n, processes, m});
-    require(quadratic, "quadratic", {n, processes});
-    require(centers, "centers", {n, processes});
-    Mechanism out;
-    out.tree.bodies = jointed_bodies(parent, prismatic, rotation, translation, coordinate, ratio, offset, n);
-    describe_links(out.tree, mass, center, inertia, origin);
-    take_coordinates(out.tree, group, groups, periodic);
-    take_blocks(out.tree, ends, static_cast<int>(n));
-    take_light_parts(out.tree, loads, carried);
-    out.tree.armature = copied(armature);
-    out.gravity = {gravity(0), gravity(1), gravity(2)};
+    out.gravity = vector_at(gravity.data());
     out.forces = forces_of(forces, static_cast<int>(n));
     out.couplings = couplings_of(couplings, out.tree.bodies);
     out.constraints = constraints_of(constraints, out.tree.bodies, n, m);
@@ -309,15 +288,7 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
                 out.actuation.push_back({static_cast<int>(r), static_cast<int>(c), actuation(r, c)});
         }
     }
-    out.diffusion = {static_cast<int>(processes), copied(constant), copied(control),
-                     copied(quadratic),           copied(centers),  {}};
-    for (std::size_t w = 0; w < processes; ++w) {
-        bool depends = false;
-        for (std::size_t r = 0; r < n; ++r) {
-            for (std::size_t c = 0; c < m; ++c) depends = depends || control(r, w, c) != 0.0;
-        }
-        if (depends) out.diffusion.sloped.push_back(static_cast<int>(w));
-    }
+    out.diffusion = diffusion_of(diffusion, n, m);
     return out;
 }
 
@@ -333,8 +304,7 @@ std::tuple<double, Out, Out, Out, Out, Out> jet(const Mechanism& mechanism, In<1
 
 // M and L_vq at each row of q and v (N, n).
 std::tuple<Out, Out> jets(const Mechanism& mechanism, In<2> q, In<2> v) {
-    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
-    require_each({rows, n}, "q", q, "v", v);
+    const auto [n, rows] = rows_of(mechanism, "q", q, "v", v);
     Out Ms = array_for({rows, n, n}), As = array_for({rows, n, n});
     {
         nb::gil_scoped_release release;
@@ -350,8 +320,7 @@ std::tuple<Out, Out> jets(const Mechanism& mechanism, In<2> q, In<2> v) {
 
 // The derivative of v in (q, p) (N, n, 2n) at each row of q and v (N, n). NaN where M is not positive definite.
 Out velocity_slopes_at(const Mechanism& mechanism, In<2> q, In<2> v) {
-    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
-    require_each({rows, n}, "q", q, "v", v);
+    const auto [n, rows] = rows_of(mechanism, "q", q, "v", v);
     const Out out = array_for({rows, n, 2 * n});
     nb::gil_scoped_release release;
     kernels_of(mechanism).velocity_slopes(mechanism, rows, q.data(), v.data(), out.data());
@@ -361,8 +330,7 @@ Out velocity_slopes_at(const Mechanism& mechanism, In<2> q, In<2> v) {
 // At each row of q, v and the constant force f (N, n): the forces of elements and couplings besides L_q, dF/dq and
 // dF/dv of the elements, and the dissipated power.
 std::tuple<Out, Out, Out, Out> forces(const Mechanism& mechanism, In<2> q, In<2> v, In<2> f) {
-    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
-    require_each({rows, n}, "q", q, "v", v, "f", f);
+    const auto [n, rows] = rows_of(mechanism, "q", q, "v", v, "f", f);
     const std::array<Out, 4> found{array_for({rows, n}), array_for({rows, n}), array_for({rows, n}),
                                    array_for({rows, n})};
     std::vector<JointForce<double>> sum(n);
@@ -381,8 +349,7 @@ std::tuple<Out, Out, Out, Out> forces(const Mechanism& mechanism, In<2> q, In<2>
 
 // At each row of q and v (N, n): the forces of couplings besides L_q, and dF/dq and dF/dv (N, n, n).
 std::tuple<Out, Out, Out> coupled_forces(const Mechanism& mechanism, In<2> q, In<2> v) {
-    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
-    require_each({rows, n}, "q", q, "v", v);
+    const auto [n, rows] = rows_of(mechanism, "q", q, "v", v);
     const Out F = array_for({rows, n}), Fq = array_for({rows, n, n}), Fv = array_for({rows, n, n});
     std::vector<JointForce<double>> sum(n);
     CouplingWorkspace<double> workspace;
@@ -397,8 +364,7 @@ std::tuple<Out, Out, Out> coupled_forces(const Mechanism& mechanism, In<2> q, In
 
 // Derivatives of M, L_vq and L_qq along (alpha, beta) at each row of q, v, alpha and beta (N, n).
 std::tuple<Out, Out, Out> jets_along(const Mechanism& mechanism, In<2> q, In<2> v, In<2> alpha, In<2> beta) {
-    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
-    require_each({rows, n}, "q", q, "v", v, "alpha", alpha, "beta", beta);
+    const auto [n, rows] = rows_of(mechanism, "q", q, "v", v, "alpha", alpha, "beta", beta);
     const Out M = array_for({rows, n, n}), A = array_for({rows, n, n}), Lqq = array_for({rows, n, n});
     {
         nb::gil_scoped_release release;
@@ -453,14 +419,11 @@ std::tuple<Out, Out> constraint_curvature(const Mechanism& mechanism, In<1> q, I
 }  // namespace
 
 void register_mechanism(nb::module_& m) {
-    m.def("element_kinds", &element_kinds);
-    m.def("coupling_kinds", &coupling_kinds);
+    m.def("element_kinds", &kinds_of<Element>);
+    m.def("coupling_kinds", &kinds_of<CoupledElement>);
     nb::class_<Mechanism>(m, "Mechanism")
-        .def_static("make", &mechanism_of, nb::kw_only(), "parent"_a, "prismatic"_a, "rotation"_a, "translation"_a,
-                    "mass"_a, "center"_a, "inertia"_a, "coordinate"_a, "ratio"_a, "offset"_a, "origin"_a, "loads"_a,
-                    "carried"_a, "periodic"_a, "armature"_a, "group"_a, "groups"_a, "ends"_a, "gravity"_a, "forces"_a,
-                    "couplings"_a, "constraints"_a, "custom"_a.none(), "actuation"_a, "constant"_a, "control"_a,
-                    "quadratic"_a, "centers"_a)
+        .def_static("make", &mechanism_of, "tree"_a, nb::kw_only(), "gravity"_a, "forces"_a, "couplings"_a,
+                    "constraints"_a, "custom"_a.none(), "actuation"_a, "diffusion"_a)
         .def("jet", &jet, "q"_a, "v"_a)
         .def("jets", &jets, "q"_a, "v"_a)
         .def("velocity_slopes", &velocity_slopes_at, "q"_a, "v"_a)

@@ -6,12 +6,9 @@ NB_MODULE(_core, m) {
     // A user's function may refer to the scene that owns it; such cycles at the exit of Python are no leaks.
     nanobind::set_leak_warnings(false);
     varpin::border::register_mechanism(m);
-    varpin::border::register_kinematics(m);
     varpin::border::register_explicit(m);
     varpin::border::register_backward(m);
     varpin::border::register_rollouts(m);
-    varpin::border::register_constrained(m);
-    varpin::border::register_checks(m);
     varpin::border::register_costs(m);
     varpin::border::register_filter(m);
 }

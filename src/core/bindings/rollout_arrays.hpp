@@ -3,39 +3,14 @@
 #pragma once
 
 #include <cstdint>
-#include <initializer_list>
 #include <optional>
 #include <stdexcept>
-#include <string>
 
 #include "arrays.hpp"
 #include "varpin/nodes.hpp"
 #include "varpin/policy.hpp"
 
 namespace varpin::border {
-
-// An array of a named tuple. It is never converted: its owner sees what is written to it, and keeps it.
-template <class Array>
-Array field(nb::handle record, const char* name) {
-    Array array;
-    if (!nb::try_cast(record.attr(name), array, false))
-        throw nb::type_error((std::string(name) + " is no contiguous array of the right kind").c_str());
-    return array;
-}
-
-// Its numbers, of this shape.
-template <class Array>
-auto field(nb::handle record, const char* name, std::initializer_list<std::size_t> shape) {
-    const Array array = field<Array>(record, name);
-    require(array, name, shape);
-    return array.data();
-}
-
-// The same of an array that may be left out, empty along its first axis; null then.
-template <class Array>
-auto optional_field(nb::handle record, const char* name, std::initializer_list<std::size_t> shape) {
-    return field<Array>(record, name).shape(0) == 0 ? nullptr : field<Array>(record, name, shape);
-}
 
 // The nodes of `paths` paths.
 inline Nodes nodes_of(const Mechanism& mechanism, nb::handle nodes, std::size_t paths) {

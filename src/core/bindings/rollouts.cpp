@@ -3,6 +3,7 @@
 #include <nanobind/stl/tuple.h>
 
 #include <algorithm>
+#include <array>
 #include <atomic>
 #include <cstdint>
 #include <memory>
@@ -42,6 +43,11 @@ Guards guards_of(bool active, double branch_margin, double energy_balance, doubl
     return {active, branch_margin, energy_balance, energy_budget, most_halvings};
 }
 
+void require_places(const In<2>& places, const Tableau& tableau) {
+    const auto stages = static_cast<std::size_t>(tableau.stages);
+    require(places, "places", {stages + 1, stages});
+}
+
 // A stepper that the forks of a rollout share; one thread at a time.
 struct SharedStepper {
     std::unique_ptr<VariationalStepper> stepper;
@@ -76,7 +82,7 @@ class Rollout {
           constrained_(places),
           states_(paths, PathState(mechanism, tableau.stages)) {
         if (places) {
-            require(*places, "places", {static_cast<std::size_t>(stages_) + 1, static_cast<std::size_t>(stages_)});
+            require_places(*places, tableau);
             shared_->stepper = constrained_stepper(mechanism, tableau, copied(*places), tolerance, guards);
         } else {
             shared_->stepper = std::make_unique<VariationalStepper>(mechanism, tableau, tolerance, guards, left,
@@ -172,16 +178,37 @@ VariationalLinearization linearization(const StepsAt& at) {
     return {at.mechanism, at.tableau, at.tolerance, at.guards, kernels_of(at.mechanism)};
 }
 
-auto derivatives(const StepsAt& at, bool ramp, bool external, const Parameters* parameters) {
-    VariationalLinearization work = linearization(at);
-    work.varies = at.varies;
-    if (external) work.take_external();
-    work.take(Parameters::of(parameters, at.n));
-    return at.derivatives(ramp ? at.n : 0, work.parameters(),
-                          [&](std::size_t s, double* Jx, double* Jf, double* Jr, double* Jp) {
-                              return work.first(at.h, at.q(s), at.p(s), at.guess(s), at.force(s), at.halvings(s), Jx,
-                                                Jf, at.past(s), ramp ? Jr : nullptr, Jp);
-                          });
+// The derivatives of `StepDerivatives` of each step, whose kinds that are not wanted are empty along their last axis;
+// the outcome, and the number of steps done. Under constraints there are `places` and `rates`.
+std::tuple<Out, Out, Out, Out, Out, std::int64_t, std::size_t> derivatives(const StepsAt& at, bool ramp, bool external,
+                                                                           const Parameters* parameters,
+                                                                           const std::optional<In<2>>& places,
+                                                                           const std::optional<In<2>>& rates) {
+    const std::size_t N = at.N, rows = 2 * at.n;
+    std::unique_ptr<StepLinearization> work;
+    if (places) {
+        require_places(*places, at.tableau);
+        work = constrained_linearization(at, copied(*places));
+    } else {
+        work.reset(new VariationalLinearization(linearization(at)));
+    }
+    work->varies = at.varies;
+    if (external) work->take_external();
+    work->take(Parameters::of(parameters, at.n));
+    const std::size_t driven = rates ? at.mechanism.constraints.driven().size() : 0;
+    if (rates) require(*rates, "rates", {N, driven});
+    const std::size_t columns[] = {rows, at.n, ramp ? at.n : 0, driven, work->parameters()};
+    std::array<Out, 5> found;
+    for (int kind = 0; kind < 5; ++kind) found[kind] = array_for({N, rows, columns[kind]});
+    const auto [outcome, done] = at.each([&](std::size_t s) {
+        RepeatedStep step = at.step(s);
+        if (rates) step.rates = rates->data() + s * driven;
+        const auto of = [&](int kind) {
+            return columns[kind] > 0 ? found[kind].data() + s * rows * columns[kind] : nullptr;
+        };
+        return work->first(step, {of(0), of(1), of(2), of(3), of(4)});
+    });
+    return {found[0], found[1], found[2], found[3], found[4], outcome, done};
 }
 
 // z . d2(q1, p1)/d(q0, p0, f)2 of each step (N, 3n, 3n), for the rows of z (N, 2n).
@@ -191,10 +218,8 @@ std::tuple<Out, std::int64_t, std::size_t> curvatures(const StepsAt& at, In<2> z
     const Out found = array_for({N, 3 * n, 3 * n});
     VariationalLinearization work = linearization(at);
     work.varies = at.varies;
-    const auto [outcome, done] = at.each([&](std::size_t s) {
-        return work.second(at.h, at.q(s), at.p(s), at.guess(s), at.force(s), at.halvings(s), z.data() + s * 2 * n,
-                           found.data() + s * 9 * n * n, at.past(s));
-    });
+    const auto [outcome, done] = at.each(
+        [&](std::size_t s) { return work.second(at.step(s), z.data() + s * 2 * n, found.data() + s * 9 * n * n); });
     return {found, outcome, done};
 }
 
@@ -204,9 +229,8 @@ std::tuple<Out, Out, std::int64_t, std::size_t> ends(const StepsAt& at) {
     const Out Q = array_for({N, n}), V = array_for({N, n});
     VariationalLinearization work = linearization(at);
     work.varies = at.varies;
-    const auto [outcome, done] = at.each([&](std::size_t s) {
-        return work.end(at.h, at.q(s), at.p(s), at.force(s), at.halvings(s), Q.data() + s * n, V.data() + s * n);
-    });
+    const auto [outcome, done] =
+        at.each([&](std::size_t s) { return work.end(at.step(s), Q.data() + s * n, V.data() + s * n); });
     return {Q, V, outcome, done};
 }
 
@@ -241,7 +265,8 @@ void register_rollouts(nb::module_& m) {
                       Bytes, In<3>>(),
              "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a, "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a,
              "halvings"_a, "guess"_a, nb::keep_alive<1, 2>())
-        .def("derivatives", &derivatives, "ramp"_a = false, "external"_a = false, "parameters"_a.none() = nb::none())
+        .def("derivatives", &derivatives, "ramp"_a = false, "external"_a = false, "parameters"_a.none() = nb::none(),
+             "places"_a.none() = nb::none(), "rates"_a.none() = nb::none())
         .def("curvatures", &curvatures, "z"_a)
         .def("ends", &ends);
 }

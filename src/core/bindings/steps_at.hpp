@@ -14,7 +14,7 @@
 
 #include "arrays.hpp"
 #include "varpin/guards.hpp"
-#include "varpin/sensitivities.hpp"
+#include "varpin/repeated_steps.hpp"
 
 namespace varpin::border {
 
@@ -88,22 +88,18 @@ class StepsAt {
     const std::size_t n, N;
     const bool varies;  // whether there is a force for each stage
 
-    const double* q(std::size_t s) const { return q_.data() + s * n; }
-    const double* p(std::size_t s) const { return p_.data() + s * n; }
-    const double* force(std::size_t s) const { return force_.data() + s * force_.shape(1) * n; }
-    // The halvings of the parts of a step; empty for an undivided step.
-    std::span<const std::uint8_t> halvings(std::size_t s) const {
-        return {halvings_.data() + place_[s], place_[s + 1] - place_[s]};
+    // Step s. Its guess may use the consecutive undivided steps before it, eight at most.
+    RepeatedStep step(std::size_t s) const {
+        int past = 0;
+        while (past < 8 && s > static_cast<std::size_t>(past) && place_[s - past - 1] == place_[s]) ++past;
+        return {.h = h,
+                .q = q_.data() + s * n,
+                .p = p_.data() + s * n,
+                .force = force_.data() + s * force_.shape(1) * n,
+                .guess = guess_.data() + s * guess_.shape(1) * n,
+                .halvings = {halvings_.data() + place_[s], place_[s + 1] - place_[s]},
+                .past = past};
     }
-    // The number of consecutive undivided steps before a step, up to the number that its guess uses.
-    int past(std::size_t s) const {
-        int found = 0;
-        while (found < 8 && s > static_cast<std::size_t>(found) && place_[s - found - 1] == place_[s]) ++found;
-        return found;
-    }
-
-    // Stage velocities (s, n) close to those of an undivided step.
-    const double* guess(std::size_t s) const { return guess_.data() + s * guess_.shape(1) * n; }
 
     // The outcome of the first step that was not solved, and the number of steps before it. take(step) takes a step.
     template <class Take>
@@ -114,22 +110,6 @@ class StepsAt {
             if (outcome != Outcome::solved) return {static_cast<std::int64_t>(outcome), s};
         }
         return {static_cast<std::int64_t>(Outcome::solved), N};
-    }
-
-    // d(q1, p1)/d(q0, p0) (N, 2n, 2n), d(q1, p1)/df (N, 2n, n), `more` further columns (N, 2n, more) and those in
-    // `parameters` (N, 2n, k) of each step, and what `each` returns. first(step, Jx, Jf, Jr, Jp) writes the derivatives
-    // of one step.
-    template <class First>
-    std::tuple<Out, Out, Out, Out, std::int64_t, std::size_t> derivatives(std::size_t more, std::size_t parameters,
-                                                                          const First& first) const {
-        const Out X = array_for({N, 2 * n, 2 * n}), F = array_for({N, 2 * n, n}), R = array_for({N, 2 * n, more}),
-                  P = array_for({N, 2 * n, parameters});
-        const auto [outcome, done] = each([&](std::size_t s) {
-            const std::size_t row = s * 2 * n;
-            return first(s, X.data() + row * 2 * n, F.data() + row * n, R.data() + row * more,
-                         parameters ? P.data() + row * parameters : nullptr);
-        });
-        return {X, F, R, P, outcome, done};
     }
 
   private:

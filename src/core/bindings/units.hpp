@@ -12,9 +12,12 @@ struct Guards;
 struct Kernels;
 struct Mechanism;
 struct Tableau;
+class StepLinearization;
 class VariationalStepper;
 
 namespace border {
+
+class StepsAt;
 
 // The inner loops for the number of joints of a mechanism; those for any number where none that is compiled fits.
 const Kernels& kernels_of(const Mechanism& mechanism);
@@ -22,15 +25,13 @@ const Kernels& kernels_of(const Mechanism& mechanism);
 std::unique_ptr<VariationalStepper> constrained_stepper(const Mechanism& mechanism, const Tableau& tableau,
                                                         const std::vector<double>& places, double tolerance,
                                                         const Guards& guards);
+std::unique_ptr<StepLinearization> constrained_linearization(const StepsAt& at, const std::vector<double>& places);
 
 // Of each unit.
 void register_mechanism(nanobind::module_& m);
-void register_kinematics(nanobind::module_& m);
 void register_explicit(nanobind::module_& m);
 void register_backward(nanobind::module_& m);
 void register_rollouts(nanobind::module_& m);
-void register_constrained(nanobind::module_& m);
-void register_checks(nanobind::module_& m);
 void register_costs(nanobind::module_& m);
 void register_filter(nanobind::module_& m);
 

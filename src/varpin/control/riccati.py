@@ -1,13 +1,12 @@
 """The backward recursion along a motion: feedback, the change of the controls, the foreseen decrease, and noise costs.
 
 Equation (O2) of docs/mathematics.md. Where the recursion loses too many digits, the value function is kept as a sum of
-squares (1/2) |R x + r|^2, without its Hessian R'R: see ``square_root.hpp`` in ``src/core``.
+squares (1/2) |R x + r|^2, without its Hessian R'R: see :mod:`varpin.control.square_root`.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,11 +14,11 @@ import numpy as np
 from varpin import core
 from varpin.arrays import Floats, Mask
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.sizes import HARMLESS, ROUNDING
+from varpin.control.sizes import HARMLESS
+from varpin.control.square_root import RootPass, squares_of
 from varpin.control.stages import Layout, Recursion, Steps
 from varpin.integrators.base import noise_fields
 from varpin.linearization import velocity_at_nodes, velocity_curvature
-from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
 
 
@@ -92,13 +91,13 @@ def _pass(steps: Steps, given: Recursion, regularization: float, *, second: bool
     }
     found_arrays = {"feedforward": feedforward, "feedback": gains, "control_gradient": by_controls}
     arrays: dict[str, Any] = {**given_arrays, **found_arrays, "spread": spread, "factors": factors}
-    found: core.BackwardPass | core.RootPass
+    found: core.BackwardPass | RootPass
     if roots:
         final, running = squares_of(end.cost.gradient, end.cost.hessian), squares_of(given.gradient, given.hessian)
         if final is None or running is None:
             return None
-        found = core.RootPass(m, final.after(end.slopes).padded(X).core, gradient)
-        failed = found.run(problem.dt, problem.hold, float(regularization), running=running.core, **arrays)
+        found = RootPass(m, final.after(end.slopes).padded(X), gradient)
+        failed = found.run(problem.dt, problem.hold, float(regularization), running=running, **arrays)
     else:
         found = core.BackwardPass(m, gradient, hessian)
         failed = found.run(problem.dt, problem.hold, float(regularization), **arrays)
@@ -146,46 +145,3 @@ def noise_shares(problem: OptimalControlProblem, motion: Trajectory, plan: Plan)
         g[:, n:] += (1.0 - left) * noise_fields(scene, motion, q[1:], v[1:], problem.q0).F
     added: Floats = 0.5 * np.einsum("Nai,Nai->N", g, plan.spread @ g)
     return added
-
-
-@dataclass(frozen=True, eq=False)
-class Squares(Frozen):
-    """N convex functions (1/2) |L z + r|^2 + c . z, up to constants."""
-
-    root: Floats  # L (N, z, z), or (1, z, z) for all
-    shift: Floats  # r (N, z)
-    linear: Floats  # c (N, z)
-
-    def after(self, D: Floats) -> Squares:
-        """The functions of x with z = D x."""
-        return Squares(self.root @ D, self.shift, self.linear @ D)
-
-    def padded(self, size: int) -> Squares:
-        """The same functions of ``size`` variables."""
-        more = size - self.shift.shape[1]
-        root = np.pad(self.root, ((0, 0), (0, more), (0, more)))
-        return Squares(root, *(np.pad(part, ((0, 0), (0, more))) for part in (self.shift, self.linear)))
-
-    @property
-    def core(self) -> core.Squares:
-        """The squares as an object of the compiled core."""
-        return core.Squares(self.root, self.shift, self.linear)
-
-
-def squares_of(gradient: Floats, hessian: Floats) -> Squares | None:
-    """Squares from ``gradient`` (N, z) and ``hessian`` (N, z, z) or (1, z, z); None if one is not semidefinite.
-
-    The linear part has only the gradient's component in the Hessian's null space: in squares a gradient keeps its
-    digits.
-    """
-    size = np.sqrt(np.abs(np.diagonal(hessian, axis1=-2, axis2=-1)))
-    unit = np.where(size > 0.0, size, 1.0)
-    values, vectors = np.linalg.eigh(hessian / (unit[..., :, None] * unit[..., None, :]))
-    if not (values >= -ROUNDING).all():
-        return None
-    weight, known = np.sqrt(np.maximum(values, 0.0)), values > ROUNDING
-    across = np.swapaxes(vectors, -1, -2)
-    along = (across @ (gradient / unit)[..., None])[..., 0]
-    shift = np.where(known, along / np.where(known, weight, 1.0), 0.0)
-    linear = unit * (vectors @ np.where(known, 0.0, along)[..., None])[..., 0]
-    return Squares(weight[..., :, None] * across * unit[..., None, :], shift, linear)

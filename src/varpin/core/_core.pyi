@@ -6,7 +6,7 @@ from enum import Enum, IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.core.arrays import Commands, ConstraintRows, FilterLog, RolloutArrays
+from varpin.core.arrays import Commands, ConstraintRows, Diffusion, FilterLog, RolloutArrays, Tree
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -20,35 +20,15 @@ class Mechanism:
 
     @staticmethod
     def make(
+        tree: Tree,
         *,
-        parent: Integers,
-        prismatic: Integers,
-        rotation: Floats,
-        translation: Floats,
-        mass: Floats,
-        center: Floats,
-        inertia: Floats,
-        coordinate: Integers,
-        ratio: Floats,
-        offset: Floats,
-        origin: Integers,
-        loads: Integers,
-        carried: Integers,
-        periodic: Integers,
-        armature: Floats,
-        group: Integers,
-        groups: int,
-        ends: Integers,
         gravity: Floats,
         forces: Sequence[tuple[str, int, tuple[float, ...]]],
         couplings: Sequence[tuple[str, int, int, tuple[float, ...]]],
         constraints: ConstraintRows,
         custom: Callable[[Floats, Floats, bool], tuple[Floats, Floats, Floats]] | None,
         actuation: Floats,
-        constant: Floats,
-        control: Floats,
-        quadratic: Floats,
-        centers: Floats,
+        diffusion: Diffusion,
     ) -> Mechanism:
         """Raises ValueError for arrays that do not fit each other or describe no tree."""
 
@@ -160,7 +140,7 @@ class Rollout:
         """The constraint row that was closest to dependence on the others at the end of a path."""
 
 class Parameters:
-    """Parameters of a mechanism; see src/core/include/varpin/sensitivities.hpp.
+    """Parameters of a mechanism; see src/core/include/varpin/repeated_steps.hpp.
 
     Each is a pair of mechanisms, above and below it, and their ``distance`` (k,). ``gears`` (k, 2, n) are the factors
     by which forces of controls are greater there.
@@ -194,13 +174,19 @@ class Steps:
         """Raises ValueError for arrays that do not fit each other."""
 
     def derivatives(
-        self, ramp: bool = False, external: bool = False, parameters: Parameters | None = None
-    ) -> tuple[Floats, Floats, Floats, Floats, int, int]:
+        self,
+        ramp: bool = False,
+        external: bool = False,
+        parameters: Parameters | None = None,
+        places: Floats | None = None,
+        rates: Floats | None = None,
+    ) -> tuple[Floats, Floats, Floats, Floats, Floats, int, int]:
         """Derivatives of steps, the outcome, and the number of steps done.
 
-        They are those of (q1, p1) in (q0, p0) (N, 2n, 2n), in a constant force f (N, 2n, n), and with ``ramp`` in one
-        that grows linearly from 0 at the start of a step to f at its end (N, 2n, n), else (N, 2n, 0), and in k
-        parameters (N, 2n, k). ``external``: f is not the force of the controls, which drives limit, but acts beside it.
+        They are those of (q1, p1) in (q0, p0) (N, 2n, 2n), in a constant force f (N, 2n, n), with ``ramp`` in one that
+        grows linearly from 0 at the start of a step to f at its end (N, 2n, n), in the rates (N, i) of driven joints
+        (N, 2n, i), and in k parameters (N, 2n, k); what is not asked for has no columns. Under constraints there are
+        ``places`` and ``rates``. ``external``: f is not the force of the controls, which drives limit, but acts beside.
         """
 
     def curvatures(self, z: Floats) -> tuple[Floats, int, int]:
@@ -209,26 +195,10 @@ class Steps:
     def ends(self) -> tuple[Floats, Floats, int, int]:
         """Configurations and velocities (N, n) at the end of each step, the outcome, and the number of steps done."""
 
-def constrained_derivatives(
-    steps: Steps,
-    *,
-    places: Floats,
-    rates: Floats,
-    ramp: bool = False,
-    external: bool = False,
-    parameters: Parameters | None = None,
-) -> tuple[Floats, Floats, Floats, Floats, int, int]:
-    """Derivatives as of :meth:`Steps.derivatives`; the third are those in the rates (N, i) of driven joints (N, 2n, i).
+class BackwardPass:
+    """The recursion from the terminal cost's gradient (2n,) and Hessian (2n, 2n) in x."""
 
-    With ``ramp`` those in the force are those in the one that grows.
-    """
-
-class Squares:
-    """N functions (1/2) |L z + r|^2 + c . z: root L (N, z, z) or (1, z, z), shift r and linear c (N, z)."""
-
-    def __init__(self, root: Floats, shift: Floats, linear: Floats) -> None: ...
-
-class _Pass:
+    def __init__(self, controls: int, gradient: Floats, hessian: Floats) -> None: ...
     @property
     def slope(self) -> float:
         """Sum of Qu . k."""
@@ -240,7 +210,7 @@ class _Pass:
         """The cost of noise."""
     @property
     def loss(self) -> float:
-        """The largest relative rounding error of a pivot of Quu, or of its root."""
+        """The largest relative rounding error of a pivot of Quu."""
     def run(
         self,
         h: float,
@@ -259,26 +229,17 @@ class _Pass:
         control_gradient: Floats,
         spread: Floats,
         factors: Floats,
-        running: Squares = ...,
     ) -> int:
         """Pass over a block of N steps, the last block first; returns -1, or the decision without a minimum.
 
         Each control is held over ``hold`` steps, for R decisions. The linearized dynamics and the expanded costs are
-        described in src/core/include/varpin/steps.hpp; ``running``, of a :class:`RootPass` alone, has the costs of the
-        steps as squares. Written are the gains of u + k + K (x - x_nominal), ``feedforward`` (R, m) and ``feedback``
-        (R, m, 2n); ``control_gradient`` (R, m) of the cost; with noise ``spread`` (N, 2n, 2n), S; and ``factors``
-        (R, m, m), L D L' of the regularized Quu.
+        described in src/core/include/varpin/backward.hpp. Written are the gains of u + k + K (x - x_nominal),
+        ``feedforward`` (R, m) and ``feedback`` (R, m, 2n); ``control_gradient`` (R, m) of the cost; with noise
+        ``spread`` (N, 2n, 2n), S; and ``factors`` (R, m, m), L D L' of the regularized Quu.
         """
 
-class BackwardPass(_Pass):
-    """The recursion from the terminal cost's gradient (2n,) and Hessian (2n, 2n) in x."""
-
-    def __init__(self, controls: int, gradient: Floats, hessian: Floats) -> None: ...
-
-class RootPass(_Pass):
-    """:class:`BackwardPass` on square roots, from the terminal cost in x as squares, and its gradient (2n,)."""
-
-    def __init__(self, controls: int, terminal: Squares, gradient: Floats) -> None: ...
+def triangular(rows: Floats, leading: int) -> Floats:
+    """The first rows (leading, c) of R in rows (r, c) = Q R, triangular in as many columns."""
 
 def foresee(
     hold: int,
@@ -302,19 +263,7 @@ class Links:
     """Some bodies of a tree with all their ancestors; see src/core/include/varpin/kinematics.hpp."""
 
     @staticmethod
-    def make(
-        *,
-        parent: Integers,
-        prismatic: Integers,
-        rotation: Floats,
-        translation: Floats,
-        coordinate: Integers,
-        ratio: Floats,
-        offset: Floats,
-        mass: Floats,
-        center: Floats,
-        dof: int,
-    ) -> Links:
+    def make(tree: Tree) -> Links:
         """Raises ValueError for arrays that do not fit each other or describe no tree."""
 
     def place_frame(self, turned: Floats, shifted: Floats, q: Floats, jacobian: bool) -> tuple[Floats, Floats, Floats]:

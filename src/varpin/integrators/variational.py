@@ -17,7 +17,6 @@ from varpin.core import (
     Rollout,
     Steps,
     Tableau,
-    constrained_derivatives,
     filter_variational,
 )
 from varpin.core.arrays import Commands, FilterArrays, FilterLog, RolloutArrays, new_nodes
@@ -268,19 +267,17 @@ class Variational(Compiled):
         Without ``ramp`` the third array is empty. With ``external`` the force is one that drives do not limit. The
         columns of velocities of cubic inputs follow those of the force, as in :attr:`Scene.transmission`.
         """
-        steps = Steps(**self._steps(scene, trajectory))
+        given: dict[str, Any] = {"ramp": ramp, "external": external, "parameters": parameters}
+        cubic: list[int] = []
         if scene.constraints:
-            rates, cubic = _rates(scene, trajectory)
-            given: dict[str, Any] = {"rates": rates, "places": self._places(scene), "external": external}
-            given["parameters"] = parameters
-            found = []
-            for growing in (False, True) if ramp else (False,):
-                Jx, Jf, by_rate, Jp, outcome, done = constrained_derivatives(steps, **given, ramp=growing)
-                _require_solved(trajectory, outcome, done)
-                found.append(np.concatenate([Jf, by_rate[:, :, cubic]], axis=2) if cubic else Jf)
-            return Jx, found[0], found[1] if ramp else Jf[:0], Jp
-        Jx, Jf, Jr, Jp, outcome, done = steps.derivatives(ramp, external, parameters)
+            given["rates"], cubic = _rates(scene, trajectory)
+            given["places"] = self._places(scene)
+        steps = Steps(**self._steps(scene, trajectory))
+        Jx, Jf, Jr, by_rate, Jp, outcome, done = steps.derivatives(**given)
         _require_solved(trajectory, outcome, done)
+        if cubic:
+            Jf = np.concatenate([Jf, by_rate[:, :, cubic]], axis=2)
+            Jr = np.concatenate([Jr, by_rate[:, :, cubic]], axis=2) if ramp else Jr
         return Jx, Jf, Jr, Jp
 
     def _contract_by_differences(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
@@ -304,7 +301,7 @@ class Variational(Compiled):
             by[:, cubic] += shift[:, 3 * n :]
             at = {"q": steps["q"] + shift[:, :n], "p": steps["p"] + shift[:, n : 2 * n]}
             at["force"] = steps["force"] + shift[:, None, 2 * n : 3 * n]
-            Jx, Jf, Jr, _, outcome, done = constrained_derivatives(Steps(**(steps | at)), places=places, rates=by)
+            Jx, Jf, _, Jr, _, outcome, done = Steps(**(steps | at)).derivatives(places=places, rates=by)
             _require_solved(trajectory, outcome, done)
             J = np.concatenate([Jx, Jf, Jr[:, :, cubic]], axis=2)
             found: Floats = np.einsum("Na,Nab->Nb", z, J)

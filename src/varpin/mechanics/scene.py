@@ -440,14 +440,16 @@ class Scene(Frozen):
     @cached_property
     def core(self) -> Mechanism:
         """The scene in the compiled core, without noise fields that only Python can evaluate."""
-        fields, rows = self.diffusion, self.bound_constraints.rows
-        return mechanism(
-            self.robot.tree,
+        rows = self.bound_constraints.rows
+        tree = self.robot.tree._replace(
             **(self._constrained_tree() if self.constraints else {}),
             group=self.group,
             groups=int(self.group.max()) + 1,
             ends=np.array([self.robot.dof]) if self.constraints else block_ends(self.group),
             armature=self.armature,
+        )
+        return mechanism(
+            tree,
             gravity=self.gravity,
             forces=self.elements,
             couplings=self.couplings,
@@ -461,13 +463,10 @@ class Scene(Frozen):
             ),
             custom=None if self.custom is None else weakref.proxy(self.custom),
             actuation=self.actuation,
-            constant=fields.constant,
-            control=fields.control,
-            quadratic=fields.quadratic,
-            centers=fields.center,
+            diffusion=self.diffusion,
         )
 
-    def _constrained_tree(self) -> dict[str, NDArray[np.int64]]:
+    def _constrained_tree(self) -> dict[str, Any]:
         """Fields of the tree that differ under constraints."""
         tree, rows = self.robot.tree, self.bound_constraints.rows
         # Constraints do work on light parts, so these have no energy balance of their own.

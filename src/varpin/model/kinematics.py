@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 
 # What the core's links take of a tree's bodies.
-_BODY = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio", "offset", "mass", "center")
+_BODY = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio", "offset", "mass", "center", "inertia",
+         "origin")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +33,7 @@ class Links(Frozen):
     @cached_property
     def core(self) -> Core:
         """These links as the compiled core takes them."""
-        return Core.make(**{name: getattr(self.tree, name) for name in _BODY}, dof=self.tree.armature.size)
+        return Core.make(self.tree)
 
     @cached_property
     def key(self) -> bytes:

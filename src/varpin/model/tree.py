@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Integers
 from varpin.core import Mechanism
-from varpin.core.arrays import ConstraintRows, Tree
+from varpin.core.arrays import ConstraintRows, Diffusion, Tree
 from varpin.errors import RobotError, UnknownFrame, UnsupportedJoint
 from varpin.model.mimic import Tie
 
@@ -201,9 +201,10 @@ def periodic_coordinates(coordinate: Integers, prismatic: Integers, ratio: Float
 def mechanism(tree: Tree, **values: Any) -> Mechanism:
     """A tree in the compiled core, with other ``values``: forces, for one, of which it has none."""
     n = tree.armature.size
-    none: dict[str, Any] = dict.fromkeys(("actuation", "constant", "quadratic", "centers"), np.zeros((n, 0)))
-    none |= {"gravity": np.zeros(3), "forces": (), "couplings": (), "constraints": ConstraintRows(), "custom": None}
-    return Mechanism.make(**(tree._asdict() | none | {"control": np.zeros((n, 0, 0))} | values))
+    none = np.zeros((n, 0))
+    given: dict[str, Any] = {"gravity": np.zeros(3), "forces": (), "couplings": (), "constraints": ConstraintRows()}
+    given |= {"custom": None, "actuation": none, "diffusion": Diffusion(none, np.zeros((n, 0, 0)), none, none)}
+    return Mechanism.make(tree, **(given | values))
 
 
 def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Integers:

@@ -24,7 +24,6 @@
 #include "varpin/jet.hpp"
 #include "varpin/kernels.hpp"
 #include "varpin/nodes.hpp"
-#include "varpin/size.hpp"
 #include "varpin/tableau.hpp"
 
 namespace varpin {
@@ -164,7 +163,7 @@ class Collocation {
 
     // `factor` for the matrices in the stages' jets.
     bool factor_blocks(double h) {
-        if (stages == 1) return kernels.factor(*this, h);
+        if (stages == 1) return (this->*kernels.factor)(h);
         double* matrix = lu.data();
         int* rows = order.data();
         for (const Block& block : blocks_of(mechanism.tree, n)) {
@@ -180,7 +179,7 @@ class Collocation {
     // x with N x = right (s, n), from the factors of `factor`.
     void solve_factored(const double* right, double* x) {
         if (eliminated()) return elimination->solve(right, x);
-        if (stages == 1) return kernels.solve(*this, right, x);
+        if (stages == 1) return (this->*kernels.solve)(right, x);
         solve_blocks(right, x, [](const double* matrix, int size, const int* rows, double* b, double* y) {
             solve_lu_pivoting(matrix, size, rows, b, y);
         });
@@ -209,6 +208,7 @@ class Collocation {
     }
 
     static constexpr int most_corrections = 10;
+    static constexpr bool bordered = false;
     // Of shortened corrections: how often they begin, how many there are each time, and how short they may be.
     static constexpr int most_approaches = 4;
     static constexpr int most_shortened = 40;
@@ -230,43 +230,59 @@ class Collocation {
     std::vector<double> element_curvature;  // (n) of the elements' potentials, if there is an elimination
     std::vector<double> diagonal;           // (n) of N, without the contributions of bodies in an elimination
 
-    Outcome iterate(double h, const Start& start, double tolerance, bool jets_wanted, Effort& effort) {
-        double before = infinity, worst = infinity;
+    // Newton's method, as in `solve`, on this equation or on one that borders it with constraints: their impulses may
+    // be far from the root where the velocities are not.
+    template <class Equation>
+    static Outcome newton(Equation& equation, double h, const Start& start, double tolerance, bool jets_wanted,
+                          Effort& effort) {
+        double before = infinity, worst = infinity, worst_before = infinity;
         bool fresh = true;
-        for (int iteration = 0; iteration < most_corrections + 2; ++iteration) {
-            sweep(h, start, fresh, effort);
-            worst = residuals(h, start);
-            const bool first = iteration == 0 && !jets_wanted && worst > 0.0;
+        for (int iteration = 0; iteration < Equation::most_corrections + 2; ++iteration) {
+            worst = equation.evaluate(h, start, fresh, effort);
+            const bool first = !Equation::bordered && iteration == 0 && !jets_wanted && worst > 0.0;
             if (worst <= tolerance && !first) {
                 if (fresh || !jets_wanted) break;
                 fresh = true;
                 continue;
             }
             if (!(worst < infinity)) return Outcome::not_finite;
-            if (fresh && !factor(h)) return Outcome::fold;
-            solve_factored(residual.data(), delta.data());
-            const double size = kinetic_size(delta.data());
-            if (iteration >= most_corrections) break;
-            if (!(size <= 0.25 * before)) {
+            if (iteration >= Equation::most_corrections) break;
+            if (fresh && !equation.factor(h)) return Outcome::fold;
+            const double size = equation.correct();
+            if (!(size <= 0.25 * before) && !(Equation::bordered && worst <= 0.25 * worst_before)) {
                 // The factors may be the cause, if they are from another iterate.
                 if (fresh) break;
                 fresh = true;
                 continue;
             }
-            take_correction();
+            equation.take_correction();
             ++effort.newton_iterations;
-            const double contraction = contraction_of(before, size);
-            if (!jets_wanted && certainly_last(h, fresh, contraction, tolerance, worst)) {
-                correct_forces(h);
-                break;
-            }
+            worst_before = worst;
+            // The factor by which corrections shrink.
+            const double contraction = before < infinity ? std::sqrt(size / before) : infinity;
+            if (!jets_wanted && equation.settles(h, start, fresh, contraction, tolerance, worst)) break;
             fresh = before < infinity && !(worst * contraction * contraction * contraction <= tolerance);
             before = size;
         }
         if (!(worst <= std::max(stagnation, tolerance))) return Outcome::diverged;
-        if (jets_wanted && eliminated()) write_jets();
         effort.residual = std::max(effort.residual, worst);
         return Outcome::solved;
+    }
+
+    Outcome iterate(double h, const Start& start, double tolerance, bool jets_wanted, Effort& effort) {
+        const Outcome outcome = newton(*this, h, start, tolerance, jets_wanted, effort);
+        if (outcome == Outcome::solved && jets_wanted && eliminated()) write_jets();
+        return outcome;
+    }
+
+    double evaluate(double h, const Start& start, bool fresh, Effort& effort) {
+        sweep(h, start, fresh, effort);
+        return residuals(h, start);
+    }
+
+    double correct() {
+        solve_factored(residual.data(), delta.data());
+        return kinetic_size(delta.data());
     }
 
     // Corrections with fresh factors, each shortened until the one after it, with the same factors, is smaller (natural
@@ -274,18 +290,15 @@ class Collocation {
     Outcome approach(double h, const Start& start, Effort& effort) {
         double share = 1.0;
         for (int iteration = 0; iteration < most_shortened; ++iteration) {
-            sweep(h, start, true, effort);
-            if (!(residuals(h, start) < infinity)) return Outcome::not_finite;
+            if (!(evaluate(h, start, true, effort) < infinity)) return Outcome::not_finite;
             if (!factor(h)) return Outcome::fold;
-            solve_factored(residual.data(), delta.data());
+            const double size = correct();
             ++effort.newton_iterations;
-            const double size = kinetic_size(delta.data());
             from = V;
             for (share = std::min(1.0, 4.0 * share);; share *= 0.5) {
                 if (share < least_share) return Outcome::diverged;
                 for (int k = 0; k < stages * n; ++k) V[k] = from[k] + share * delta[k];
-                sweep(h, start, false, effort);
-                residuals(h, start);
+                evaluate(h, start, false, effort);
                 solve_factored(residual.data(), next.data());
                 const double left = kinetic_size(next.data());
                 if (share == 1.0 && left <= 1e-4 * size) return Outcome::solved;
@@ -299,14 +312,9 @@ class Collocation {
         for (int k = 0; k < stages * n; ++k) V[k] += delta[k];
     }
 
-    // The factor by which corrections shrink, from the kinetic sizes of the last two; infinite after the first.
-    static double contraction_of(double before, double size) {
-        return before < infinity ? std::sqrt(size / before) : infinity;
-    }
-
     // Whether a correction needs no evaluation of the residual that it leaves, `worst` before it: by the nonlinearity
     // of the equation if its factors were `fresh`, or by the contraction. If so, `worst` becomes the estimate.
-    bool certainly_last(double h, bool fresh, double contraction, double tolerance, double& worst) {
+    bool settles(double h, const Start&, bool fresh, double contraction, double tolerance, double& worst) {
         const double left = fresh ? left_by_bending(h, worst) : infinity;
         if (fresh && (worst <= tolerance || sure * left <= tolerance)) {
             worst = std::min(worst, left);
@@ -315,6 +323,7 @@ class Collocation {
         } else {
             return false;
         }
+        correct_forces(h);
         return true;
     }
 
@@ -427,13 +436,15 @@ class Collocation {
 
     // r(V); returns its largest entry in rounding units of its terms.
     double residuals(double h, const Start& start) {
-        return stages == 1 ? kernels.residuals(*this, h, start) : residuals_of(n, stages, h, start);
+        return stages == 1 ? (this->*kernels.residuals)(h, start) : residuals_of<int, int>(h, start);
     }
 
     // The discrete Euler-Lagrange residual r_i(V) of each stage, (S1) and (C1), into `residual`; returns the largest in
     // rounding units.
     template <class Size, class Stages>
-    double residuals_of(Size n, Stages stages, double h, const Start& start) {
+    double residuals_of(double h, const Start& start) {
+        const Size n = this->n;
+        const Stages stages = this->stages;
         double worst = 0.0;
         for (int i = 0; i < stages; ++i) {
             const double* force = start.force_at(i);
@@ -466,7 +477,7 @@ class Collocation {
 
     // The block (s width, s width) of N, (C3).
     void assemble(double h, Block block, double* matrix) {
-        if (stages == 1) return assemble_one(n, h, block, matrix);
+        if (stages == 1) return assemble_one<int>(h, block, matrix);
         const int width = block.end - block.begin, size = stages * width;
         std::fill(matrix, matrix + size * size, 0.0);
         // Row r of the derivative of L_q + F at stage j in all of V, added to the rows of N in one long loop.
@@ -503,7 +514,8 @@ class Collocation {
 
     // `assemble` for a single stage, without sums over stages.
     template <class Size>
-    void assemble_one(Size n, double h, Block block, double* matrix) const {
+    void assemble_one(double h, Block block, double* matrix) const {
+        const Size n = this->n;
         const double ahead = h * tableau.a[0], behind = h * tableau.gradient[0];
         const double *M = stage[0].M.data(), *A = stage[0].A.data(), *Lqq = stage[0].Lqq.data();
         const bool elements = mechanism.forces.any();
@@ -517,6 +529,39 @@ class Collocation {
             if (coupled()) add_coupled_row(h, 0, 0, r, block, line + block.begin);
             for (int c = block.begin; c < block.end; ++c) line[c] += M[row + c];
         }
+    }
+
+    // `factor` for a single stage. On the desired branch, the symmetric part of N is positive definite.
+    template <class Size>
+    bool factor_one(double h) {
+        const Size n = this->n;
+        double* matrix = lu.data();
+        for (const Block& block : blocks_of(mechanism.tree, n)) {
+            const int width = block.end - block.begin;
+            assemble_one<Size>(h, block, matrix);
+            if (!factor_lu(matrix, width, {0, width})) return false;
+            matrix += width * width;
+        }
+        return true;
+    }
+
+    template <class Size>
+    void solve_one(const double* right, double* x) const {
+        const double* matrix = lu.data();
+        for (const Block& block : blocks_of(mechanism.tree, Size(n))) {
+            const int width = block.end - block.begin;
+            solve_lu(matrix, width, {0, width}, right + block.begin, x + block.begin);
+            matrix += width * width;
+        }
+    }
+
+    template <class Size>
+    double kinetic_size_of_one(const double* x) const {
+        const Size n = this->n;
+        double total = 0.0;
+        for (const Block& block : blocks_of(mechanism.tree, n))
+            total += tableau.b[0] * quadratic_form(stage[0].M.data(), n, block, x);
+        return total;
     }
 
     // The contribution of couplings to a row of N_im. Not inlined, since that would slow down steps without couplings.
@@ -535,7 +580,7 @@ class Collocation {
     // The square of x (s, n) in the metric of the kinetic energy, averaged over the step.
     double kinetic_size(const double* x) {
         if (eliminated()) return elimination->kinetic_size(x);
-        if (stages == 1) return kernels.kinetic_size(*this, x);
+        if (stages == 1) return (this->*kernels.kinetic_size)(x);
         double total = 0.0;
         for (int i = 0; i < stages; ++i) {
             for (const Block& block : blocks_of(mechanism.tree, n))
@@ -593,43 +638,5 @@ class Collocation {
         }
     }
 };
-
-template <class Size>
-double Sized<Size>::residuals(Collocation& step, double h, const Start& start) {
-    return step.residuals_of(Size(step.n), Known<1>(1), h, start);
-}
-
-// On the desired branch, the symmetric part of N is positive definite.
-template <class Size>
-bool Sized<Size>::factor(Collocation& step, double h) {
-    const Size n = step.n;
-    double* matrix = step.lu.data();
-    for (const Block& block : blocks_of(step.mechanism.tree, n)) {
-        const int width = block.end - block.begin;
-        step.assemble_one(n, h, block, matrix);
-        if (!factor_lu(matrix, width, {0, width})) return false;
-        matrix += width * width;
-    }
-    return true;
-}
-
-template <class Size>
-void Sized<Size>::solve(const Collocation& step, const double* right, double* x) {
-    const double* matrix = step.lu.data();
-    for (const Block& block : blocks_of(step.mechanism.tree, Size(step.n))) {
-        const int width = block.end - block.begin;
-        solve_lu(matrix, width, {0, width}, right + block.begin, x + block.begin);
-        matrix += width * width;
-    }
-}
-
-template <class Size>
-double Sized<Size>::kinetic_size(const Collocation& step, const double* x) {
-    const Size n = step.n;
-    double total = 0.0;
-    for (const Block& block : blocks_of(step.mechanism.tree, n))
-        total += step.tableau.b[0] * quadratic_form(step.stage[0].M.data(), n, block, x);
-    return total;
-}
 
 }  // namespace varpin

@@ -49,11 +49,13 @@ class ConstrainedStepper : public VariationalStepper {
     }
 
   protected:
+    friend class Collocation;
     friend class ConstrainedLinearization;
 
-    static constexpr double most_turn = 0.7;                  // greatest relative change of C within a guarded substep
-    static constexpr double stagnation = 100.0, sure = 10.0;  // as Collocation's
+    static constexpr double most_turn = 0.7;  // greatest relative change of C within a guarded substep
+    static constexpr double sure = 10.0;      // as Collocation's
     static constexpr int most_corrections = 12;
+    static constexpr bool bordered = true;
 
     KinematicInputs inputs;
     ConstraintAlgebra algebra;
@@ -124,68 +126,15 @@ class ConstrainedStepper : public VariationalStepper {
         std::copy(rates, rates + inputs.count(), inputs.goal_rate.begin());
     }
 
-    // Newton's method on the stages and the constraints, as Collocation::solve. Factors are kept while they contract.
-    // A correction that is certain to be the last one is not evaluated unless `jets_wanted`. With `jets_wanted` it ends
-    // with the jets and C at the root, else with those of the last iterate.
+    // Newton's method on the stages and the constraints, as Collocation::solve. With `jets_wanted` it ends with the
+    // jets and C at the root, else with those of the last iterate.
     Outcome solve(double h, PathState& state, bool jets_wanted) override {
         state.weakest = here.weakest;
         if (here.toggles()) return Outcome::toggle;
         keep_start(state);
         const Start start = start_of(state);
         scale_unknowns();
-        const int size = stages * (n + here.rank());
-        double before = infinity, worst = infinity, worst_before = infinity;
-        bool fresh = true;
-        for (int iteration = 0; iteration < most_corrections + 1; ++iteration) {
-            equation.sweep(h, start, fresh, effort);
-            visit_points(h, start);
-            worst = residuals(h, start);
-            if (worst <= tolerance) {
-                if (fresh || !jets_wanted) break;
-                fresh = true;
-                continue;
-            }
-            if (!(worst < infinity)) return Outcome::not_finite;
-            if (iteration == most_corrections) break;
-            if (fresh) {
-                assemble(h);
-                if (factor_lu_pivoting(saddle.data(), size, rows.data()) == 0) return Outcome::fold;
-            }
-            find_correction();
-            const double moved = equation.kinetic_size(equation.delta.data());
-            // Impulses may be far from the root where velocities are not.
-            if (!(moved <= 0.25 * before) && !(worst <= 0.25 * worst_before)) {
-                // The cause may be factors of an earlier iterate.
-                if (fresh) break;
-                fresh = true;
-                continue;
-            }
-            take_correction();
-            ++effort.newton_iterations;
-            // With one stage there is no impulse between the ends, so constraints add no curvature.
-            double left = fresh && stages == 1 ? equation.left_by_bending(h, worst) : infinity;
-            fresh = false;
-            if (before < infinity) {
-                const double contraction = std::sqrt(moved / before);
-                left = std::min(left, contraction * worst);
-                fresh = !(worst * contraction * contraction * contraction <= tolerance);
-            }
-            if (!jets_wanted && sure * left <= tolerance) {
-                visit_points(h, start);
-                const double open = rows_error(h);
-                if (open <= tolerance) {
-                    equation.correct_forces(h);
-                    push();
-                    worst = std::max(left, open);
-                    break;
-                }
-            }
-            before = moved;
-            worst_before = worst;
-        }
-        if (!(worst <= std::max(stagnation, tolerance))) return Outcome::diverged;
-        effort.residual = std::max(effort.residual, worst);
-        return Outcome::solved;
+        return Collocation::newton(*this, h, start, tolerance, jets_wanted, effort);
     }
 
     // As EnergyGuard's, on the tangent space at the start: with a basis Z of C Z = 0, it compares Z'(M - h^2 reach / (1
@@ -275,14 +224,41 @@ class ConstrainedStepper : public VariationalStepper {
         }
     }
 
+    double evaluate(double h, const Start& start, bool fresh, Effort& effort) {
+        equation.sweep(h, start, fresh, effort);
+        visit_points(h, start);
+        return residuals(h, start);
+    }
+
+    bool factor(double h) {
+        assemble(h);
+        return factor_lu_pivoting(saddle.data(), stages * (n + here.rank()), rows.data()) != 0;
+    }
+
     // Newton's correction from the factors: of the velocities in equation.delta, of the impulses at the end of
     // `solution`.
-    void find_correction() {
+    double correct() {
         const int size = stages * (n + here.rank());
         solve_lu_pivoting(saddle.data(), size, rows.data(), right.data(), solution.data());
         for (int i = 0; i < stages; ++i) {
             for (int c = 0; c < n; ++c) equation.delta[i * n + c] = scaled[c] * solution[i * n + c];
         }
+        return equation.kinetic_size(equation.delta.data());
+    }
+
+    // As Collocation's, by the nonlinearity with one stage alone: without an impulse between the ends, constraints add
+    // no curvature.
+    bool settles(double h, const Start& start, bool fresh, double contraction, double tolerance, double& worst) {
+        const double by_bending = fresh && stages == 1 ? equation.left_by_bending(h, worst) : infinity;
+        const double left = std::min(by_bending, contraction * worst);
+        if (!(Collocation::sure * left <= tolerance)) return false;
+        visit_points(h, start);
+        const double open = rows_error(h);
+        if (!(open <= tolerance)) return false;
+        equation.correct_forces(h);
+        push();
+        worst = std::max(left, open);
+        return true;
     }
 
     // Add Newton's correction to the velocities and impulses.

@@ -4,129 +4,89 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <cstdint>
-#include <optional>
-#include <span>
-#include <utility>
+#include <memory>
 #include <vector>
 
 #include "varpin/constrained.hpp"
-#include "varpin/sensitivities.hpp"
-#include "varpin/substeps.hpp"
+#include "varpin/repeated_steps.hpp"
 
 namespace varpin {
 
-// Derivatives of the steps of a trajectory; as VariationalLinearization. They are those of a map on all of R^2n, which
-// does not require g(q0) = 0 and absorbs the part of p0 normal to the constraints.
-class ConstrainedLinearization {
+// The map of steps under constraints is on all of R^2n: it does not require g(q0) = 0, and absorbs the part of p0 that
+// is normal to the constraints. Derivatives in the rates of linear inputs are zero.
+class ConstrainedLinearization : public StepLinearization {
   public:
     ConstrainedLinearization(const Mechanism& mechanism, const Tableau& tableau, const std::vector<double>& places,
                              double tolerance, const Guards& guards, const Kernels& kernels = kernels_for<>)
-        : stepper(mechanism, tableau, places, tolerance, guards, kernels),
-          inputs(stepper.inputs),
-          here(stepper.here),
-          n(stepper.n),
-          m(stepper.m),
-          stages(stepper.stages),
-          state(mechanism, stages),
-          chained(n, inputs.count()) {}
-
-    // Parameters in which `first` takes derivatives.
-    void take(std::vector<Parameter> parameters) {
-        by_parameter.emplace(stepper.equation, std::move(parameters));
-        in_parameters.resize(entries(2 * n, by_parameter->count()));
-    }
-    std::size_t parameters() const { return by_parameter->parameters.size(); }
-
-    // With `ramp` those in the force are in one that grows linearly from 0; `rates` are those of kinematic inputs at
-    // their goals, and Jr (2n, driven rows) the derivatives in them, zero for linear ones; Jp (2n, k), unless null,
-    // those in the parameters.
-    Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
-                  const double* rates, std::span<const std::uint8_t> halvings, double* Jx, double* Jf, double* Jr,
-                  double* Jp = nullptr) {
-        stepper.take_force(force, varies, rates);
-        if (!stepper.begin_at(q, p, state, false)) return Outcome::singular;
-        if (halvings.empty()) {
-            Outcome outcome = stepper.from_guess(h, guess, state);
-            if (outcome != Outcome::solved) outcome = stepper.part(h, 0, 0.0, state);
-            if (outcome == Outcome::solved) derivatives(h, 0.0, 1.0, Jx, Jf, Jr, Jp);
-            if (outcome == Outcome::solved || !stepper.guards.active) return outcome;
-        }
-        chained.begin(Jx, Jf);
-        std::fill(Jr, Jr + chained.part_rate.size(), 0.0);
-        if (Jp) std::fill(Jp, Jp + in_parameters.size(), 0.0);
-        return parts_again(halvings, stepper.guards.halvings_again(), [&](int level, double begin) {
-            const Outcome outcome = stepper.part(h, level, begin, state);
-            if (outcome != Outcome::solved) return outcome;
-            derivatives(length_of(h, level), begin, length_of(1.0, level), chained.part.data(), chained.part_f.data(),
-                        chained.part_rate.data(), Jp ? in_parameters.data() : nullptr);
-            chained.follow(Jx, Jf);
-            chained.follow_rates(Jr);
-            if (Jp) chained.follow_more(Jp, in_parameters);
-            return outcome;
-        });
-    }
-
-    bool varies = false, ramp = false;
-    void take_external() { stepper.equation.by_external = true; }
+        : StepLinearization(
+              std::make_unique<ConstrainedStepper>(mechanism, tableau, places, tolerance, guards, kernels)),
+          constrained(static_cast<ConstrainedStepper&>(*stepper)),
+          inputs(constrained.inputs),
+          here(constrained.here),
+          m(constrained.m) {}
 
   private:
     // Parameters of a kinematic input's motion: the goal, or the rates at both ends of a cubic.
     enum class Goal { position, begin, end };
 
-    ConstrainedStepper stepper;
+    ConstrainedStepper& constrained;
     KinematicInputs& inputs;
     ConstraintBasis& here;
-    int n, m, stages;
-    PathState state;
-    ChainedDerivatives chained;
+    int m;
     std::array<std::vector<double>, 2> by_rates;  // (2n, 2n) and (2n, n), derivatives in rates at both ends
-    std::optional<ParameterColumns> by_parameter;
-    std::vector<double> in_parameters;  // (2n, k) of a part
-    std::vector<double> dV, columns, bends, y = zeros(n), shift = zeros(n);
+    std::vector<double> sides, bends, y = zeros(n), shift = zeros(n);
     std::vector<double> at = zeros(n), bend = zeros(m, n), curvature = zeros(n, n);  // at the end
 
-    // Derivatives of the last substep, from (q0, p0) under the force f: of (q1, p1) in (q0, p0), Jx, in f, Jf, and in
-    // the rates of kinematic inputs at their goals, Jr, and in parameters, Jp. It is the part of the step at `begin`
-    // with length `share`.
-    void derivatives(double h, double begin, double share, double* Jx, double* Jf, double* Jr, double* Jp) {
-        if (ramp) stepper.equation.weigh_ramp(begin, share);
-        swap(here, stepper.origin);
-        stepper.assemble(h);
-        factor_lu_pivoting(stepper.saddle.data(), stages * (n + here.rank()), stepper.rows.data());
+    // From the guess, or else from the initial velocity.
+    Outcome root(const RepeatedStep& step) override {
+        if (!enter(step)) return Outcome::singular;
+        const Outcome outcome = constrained.from_guess(step.h, step.guess, state);
+        return outcome == Outcome::solved ? outcome : constrained.part(step.h, 0, 0.0, state);
+    }
+
+    void differentiate(double h, double begin, double share, const StepDerivatives& to) override {
+        swap(here, constrained.origin);
+        constrained.factor(h);
         bend_points();
         state_columns(h);
-        end_columns(h, Jx, Jf);
+        end_columns(h, to.state, to.force);
+        if (to.ramp) {
+            constrained.equation.weigh_ramp(begin, share);
+            state_columns(h);
+            end_columns(h, again.data(), to.ramp);
+            constrained.equation.weigh_constant();
+        }
         for (int end = 0; end < 2 && inputs.cubic; ++end) {
             rate_columns(end);
             by_rates[end].resize(6 * n * n);
             end_columns(h, by_rates[end].data(), by_rates[end].data() + 4 * n * n);
         }
-        if (Jp) parameter_columns(h, Jp);
-        swap(here, stepper.origin);
+        if (to.parameters) parameter_columns(h, to.parameters);
+        swap(here, constrained.origin);
         look_at_end();
-        project(h, Goal::position, Jx, Jf);
-        if (Jp) project_parameters(Jp);
+        project(h, Goal::position, to.state, to.force);
+        if (to.ramp) project(h, Goal::position, again.data(), to.ramp);
+        if (to.parameters) project_parameters(to.parameters);
         if (!inputs.cubic) return;
         for (int end = 0; end < 2; ++end)
             project(h, end == 0 ? Goal::begin : Goal::end, by_rates[end].data(), by_rates[end].data() + 4 * n * n);
-        join_rates(Jx, Jr, Jp);
+        join_rates(to);
     }
 
     // Lam_k . g_qq (s, n, n) at the Lobatto points but the last.
     void bend_points() {
         bends.assign(entries(stages * n, n), 0.0);
         for (int k = 0; k < stages; ++k)
-            stepper.mechanism.constraints.add_curvature(&stepper.impulse[k * m], 1.0,
-                                                        k == 0 ? here.jet : stepper.point[k - 1], &bends[k * n * n]);
+            constrained.mechanism.constraints.add_curvature(
+                &constrained.impulse[k * m], 1.0, k == 0 ? here.jet : constrained.point[k - 1], &bends[k * n * n]);
     }
 
     // Row a of the border at Lobatto point k.
-    double* border(int k, int a) { return &columns[entries(stages * n + k * here.rank() + a, 3 * n)]; }
+    double* border(int k, int a) { return &sides[entries(stages * n + k * here.rank() + a, 3 * n)]; }
 
     // Right sides for derivatives in (q0, p0) and in the goals of kinematic inputs.
     void state_columns(double h) {
-        StepEquation& equation = stepper.equation;
+        StepEquation& equation = constrained.equation;
         const int r = here.rank(), wide = stages * n, w = 3 * n;
         dV.resize(entries(wide, w));
         equation.right_sides(n, stages, h, {0, n}, dV);
@@ -136,26 +96,27 @@ class ConstrainedLinearization {
         for (const DrivenRow& own : inputs.driven) {
             for (int i = 0; i < wide; ++i) dV[i * w + 2 * n + own.coordinate] = 0.0;
         }
-        columns.assign(entries(stages * (n + r), w), 0.0);
+        sides.assign(entries(stages * (n + r), w), 0.0);
         for (int i = 0; i < wide; ++i) {
             for (int c = 0; c < w; ++c) {
                 double entry = dV[i * w + c];
                 for (int k = 0; k < stages && c < n; ++k)
-                    entry -= stepper.weight[(i / n) * stages + k] * bends[(k * n + i % n) * n + c];
-                columns[i * w + c] = stepper.scaled[i % n] * entry;
+                    entry -= constrained.weight[(i / n) * stages + k] * bends[(k * n + i % n) * n + c];
+                sides[i * w + c] = constrained.scaled[i % n] * entry;
             }
         }
         for (int k = 0; k < stages; ++k) {
             for (int a = 0; a < r; ++a) {
                 const int row = here.order[a];
                 double* own = border(k, a);
-                for (int c = 0; c < n; ++c) own[c] = -stepper.row_scale[row] * stepper.point[k].C[row * n + c] / h;
+                for (int c = 0; c < n; ++c)
+                    own[c] = -constrained.row_scale[row] * constrained.point[k].C[row * n + c] / h;
                 const int d = inputs.of_row(row);
                 if (d < 0) continue;
                 const int c = inputs.driven[d].coordinate;
-                const KinematicInputs::Way way = inputs.way_at(d, stepper.way_to(k + 1));
-                own[2 * n + c] = stepper.row_scale[row] * way.ahead / h;
-                own[c] += stepper.row_scale[row] * (1.0 - way.ahead) / h;
+                const KinematicInputs::Way way = inputs.way_at(d, constrained.way_to(k + 1));
+                own[2 * n + c] = constrained.row_scale[row] * way.ahead / h;
+                own[c] += constrained.row_scale[row] * (1.0 - way.ahead) / h;
             }
         }
     }
@@ -164,30 +125,30 @@ class ConstrainedLinearization {
     // column of the goal.
     void rate_columns(int end) {
         const int r = here.rank();
-        columns.assign(entries(stages * (n + r), 3 * n), 0.0);
+        sides.assign(entries(stages * (n + r), 3 * n), 0.0);
         for (int k = 0; k < stages; ++k) {
             for (int a = 0; a < r; ++a) {
                 const int d = inputs.of_row(here.order[a]);
                 if (d < 0) continue;
                 const auto& [row, coordinate, control] = inputs.driven[d];
-                const KinematicInputs::Way way = inputs.way_at(d, stepper.way_to(k + 1));
+                const KinematicInputs::Way way = inputs.way_at(d, constrained.way_to(k + 1));
                 border(k, a)[2 * n + coordinate] =
-                    stepper.row_scale[row] * (end == 0 ? way.begin : way.end) / inputs.share;
+                    constrained.row_scale[row] * (end == 0 ? way.begin : way.end) / inputs.share;
             }
         }
     }
 
-    // Derivatives of the end of a substep without its last impulse, from the right sides in `columns` and the factors
+    // Derivatives of the end of a substep without its last impulse, from the right sides in `sides` and the factors
     // of the bordered matrix.
     void end_columns(double h, double* Jx, double* Jf) {
         const int r = here.rank(), wide = stages * n, size = stages * (n + r), w = 3 * n;
-        std::vector<double> sorted(columns.size());
-        for (int i = 0; i < size; ++i) std::copy_n(&columns[stepper.rows[i] * w], w, &sorted[i * w]);
-        solve_lu_rows(stepper.saddle.data(), size, {0, size}, sorted.data(), w, w);
+        std::vector<double> sorted(sides.size());
+        for (int i = 0; i < size; ++i) std::copy_n(&sides[constrained.rows[i] * w], w, &sorted[i * w]);
+        solve_lu_rows(constrained.saddle.data(), size, {0, size}, sorted.data(), w, w);
         for (int i = 0; i < wide; ++i) {
-            for (int c = 0; c < w; ++c) dV[i * w + c] = stepper.scaled[i % n] * sorted[i * w + c];
+            for (int c = 0; c < w; ++c) dV[i * w + c] = constrained.scaled[i % n] * sorted[i * w + c];
         }
-        stepper.equation.end_derivatives(n, stages, h, {0, n}, dV, Jx, Jf);
+        constrained.equation.end_derivatives(n, stages, h, {0, n}, dV, Jx, Jf);
         for (int c = 0; c < w; ++c)
             subtract_impulses(h, &dV[c], &sorted[wide * w + c], w, c,
                               [&](int i) -> double& { return entry(Jx, Jf, n + i, c); });
@@ -202,14 +163,14 @@ class ConstrainedLinearization {
         for (int k = 0; k < stages; ++k) {
             for (int i = 0; i < n; ++i) {
                 double sum = 0.0;
-                for (int j = 0; j < stages; ++j) sum += stepper.places[k * stages + j] * dV[(j * n + i) * w];
+                for (int j = 0; j < stages; ++j) sum += constrained.places[k * stages + j] * dV[(j * n + i) * w];
                 dQ[i] = h * sum + (own == i ? 1.0 : 0.0);
             }
             for (int i = 0; i < n; ++i) {
                 double sum = detail::inner(n, &bends[(k * n + i) * n], dQ.data());
                 for (int a = 0; a < r; ++a) {
                     const int row = here.order[a];
-                    sum += stepper.jet_at(k).C[row * n + i] * stepper.row_scale[row] * dLam[(k * r + a) * w];
+                    sum += constrained.jet_at(k).C[row * n + i] * constrained.row_scale[row] * dLam[(k * r + a) * w];
                 }
                 dp(i) -= sum;
             }
@@ -219,22 +180,22 @@ class ConstrainedLinearization {
     // Derivatives in the parameters of the end of a substep without its last impulse, from the factors of the bordered
     // matrix.
     void parameter_columns(double h, double* Jp) {
-        const int r = here.rank(), wide = stages * n, size = stages * (n + r), w = by_parameter->count();
+        const int r = here.rank(), wide = stages * n, size = stages * (n + r), w = columns->count();
         std::vector<double> right, dp, dq(n), by(size), sorted(entries(size, w));
         for (int a = 0; a < w; ++a) {
-            by_parameter->right_side(a, h, stepper.force.data(), stepper.stride, right, dp);
+            columns->right_side(a, h, constrained.force.data(), constrained.stride, right, dp);
             for (int i = 0; i < size; ++i) {
-                const int from = stepper.rows[i];
-                sorted[i * w + a] = from < wide ? stepper.scaled[from % n] * right[from] : 0.0;
+                const int from = constrained.rows[i];
+                sorted[i * w + a] = from < wide ? constrained.scaled[from % n] * right[from] : 0.0;
             }
             for (int i = 0; i < n; ++i) Jp[(n + i) * w + a] = dp[i];
         }
-        solve_lu_rows(stepper.saddle.data(), size, {0, size}, sorted.data(), w, w);
+        solve_lu_rows(constrained.saddle.data(), size, {0, size}, sorted.data(), w, w);
         for (int a = 0; a < w; ++a) {
-            for (int i = 0; i < size; ++i) by[i] = (i < wide ? stepper.scaled[i % n] : 1.0) * sorted[i * w + a];
+            for (int i = 0; i < size; ++i) by[i] = (i < wide ? constrained.scaled[i % n] : 1.0) * sorted[i * w + a];
             std::fill(dq.begin(), dq.end(), 0.0);
             std::fill(dp.begin(), dp.end(), 0.0);
-            stepper.equation.add_end_change(h, by.data(), dq.data(), dp.data());
+            constrained.equation.add_end_change(h, by.data(), dq.data(), dp.data());
             subtract_impulses(h, by.data(), &by[wide], 1, -1, [&](int i) -> double& { return dp[i]; });
             for (int i = 0; i < n; ++i) {
                 Jp[i * w + a] = dq[i];
@@ -251,10 +212,10 @@ class ConstrainedLinearization {
     void look_at_end() {
         for (auto* sum : {&bend, &curvature}) std::fill(sum->begin(), sum->end(), 0.0);
         for (int i = 0; i < n; ++i) at[i] = state.position[i].value.high;
-        Jet<double>& jet = stepper.equation.stage[0];
-        stepper.equation.kernels.jet(stepper.mechanism, at.data(), state.v.data(), jet);
-        stepper.mechanism.constraints.bend(state.v.data(), here.jet, bend.data());
-        stepper.mechanism.constraints.add_curvature(stepper.last.data(), 1.0, here.jet, curvature.data());
+        Jet<double>& jet = constrained.equation.stage[0];
+        constrained.equation.kernels.jet(constrained.mechanism, at.data(), state.v.data(), jet);
+        constrained.mechanism.constraints.bend(state.v.data(), here.jet, bend.data());
+        constrained.mechanism.constraints.add_curvature(constrained.last.data(), 1.0, here.jet, curvature.data());
     }
 
     void project(double h, Goal what, double* Jx, double* Jf) {
@@ -269,11 +230,11 @@ class ConstrainedLinearization {
     }
 
     void project_parameters(double* Jp) {
-        const int w = by_parameter->count();
+        const int w = columns->count();
         std::vector<double> dq(n);
         for (int a = 0; a < w; ++a) {
             for (int i = 0; i < n; ++i) dq[i] = Jp[i * w + a];
-            by_parameter->momentum(a, at.data(), state.v.data(), shift);
+            columns->momentum(a, at.data(), state.v.data(), shift);
             project_column(dq, shift, [](int) { return 0.0; }, [&](int i) -> double& { return Jp[(n + i) * w + a]; });
         }
     }
@@ -284,7 +245,7 @@ class ConstrainedLinearization {
     void project_column(const std::vector<double>& dq, const std::vector<double>& shift, const Rate& rate,
                         const End& dp) const {
         const int r = here.rank();
-        const Jet<double>& jet = stepper.equation.stage[0];
+        const Jet<double>& jet = constrained.equation.stage[0];
         std::vector<double> z(n), along(r), turned(n);
         for (int i = 0; i < n; ++i) {
             turned[i] = detail::inner(n, &jet.A[i * n], dq.data()) + shift[i];
@@ -322,32 +283,32 @@ class ConstrainedLinearization {
 
     // Write the derivatives in the rates at the goals, and add those by way of the rates at the beginning, which follow
     // from the momentum: v = M^-1 p, M dv = dp - L_vq dq.
-    void join_rates(double* Jx, double* Jr, double* Jp) {
+    void join_rates(const StepDerivatives& to) {
         const std::vector<DrivenRow>& driven = inputs.driven;
-        Jet<double>& jet = stepper.equation.stage[0];
-        stepper.equation.kernels.jet(stepper.mechanism, stepper.from_q.data(), stepper.from_v.data(), jet);
+        Jet<double>& jet = constrained.equation.stage[0];
+        constrained.equation.kernels.jet(constrained.mechanism, constrained.from_q.data(), constrained.from_v.data(),
+                                         jet);
         const double *at_begin = by_rates[0].data() + 4 * n * n, *at_end = by_rates[1].data() + 4 * n * n;
         for (std::size_t d = 0; d < driven.size(); ++d) {
             const int moved = driven[d].coordinate;
-            for (int i = 0; i < 2 * n; ++i)
-                Jr[i * driven.size() + d] = driven[d].rate < 0 ? 0.0 : at_end[i * n + moved];
             if (driven[d].rate < 0) continue;
+            for (int i = 0; i < 2 * n && to.rates; ++i) to.rates[i * driven.size() + d] = at_end[i * n + moved];
             std::fill(y.begin(), y.end(), 0.0);
             y[moved] = 1.0;
-            stepper.origin.whiten(y.data(), y.data());
-            stepper.origin.colour(y.data());
+            constrained.origin.whiten(y.data(), y.data());
+            constrained.origin.colour(y.data());
             for (int c = 0; c < n; ++c) {
                 double by_q = 0.0;
                 for (int j = 0; j < n; ++j) by_q -= y[j] * jet.A[j * n + c];
                 for (int i = 0; i < 2 * n; ++i) {
-                    Jx[i * 2 * n + c] += at_begin[i * n + moved] * by_q;
-                    Jx[i * 2 * n + n + c] += at_begin[i * n + moved] * y[c];
+                    to.state[i * 2 * n + c] += at_begin[i * n + moved] * by_q;
+                    to.state[i * 2 * n + n + c] += at_begin[i * n + moved] * y[c];
                 }
             }
-            for (int a = 0; Jp && a < by_parameter->count(); ++a) {
-                by_parameter->momentum(a, stepper.from_q.data(), stepper.from_v.data(), shift);
+            for (int a = 0; to.parameters && a < columns->count(); ++a) {
+                columns->momentum(a, constrained.from_q.data(), constrained.from_v.data(), shift);
                 const double by = -detail::inner(n, y.data(), shift.data());
-                for (int i = 0; i < 2 * n; ++i) Jp[i * by_parameter->count() + a] += at_begin[i * n + moved] * by;
+                for (int i = 0; i < 2 * n; ++i) to.parameters[i * columns->count() + a] += at_begin[i * n + moved] * by;
             }
         }
     }

@@ -11,10 +11,10 @@
 #include <vector>
 
 #include "varpin/dense.hpp"
+#include "varpin/dual.hpp"
 #include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
 #include "varpin/mechanism.hpp"
-#include "varpin/slopes.hpp"
 #include "varpin/spatial.hpp"
 
 namespace varpin {

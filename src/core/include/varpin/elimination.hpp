@@ -13,7 +13,6 @@
 #include <limits>
 #include <vector>
 
-#include "varpin/elimination_rows.hpp"
 #include "varpin/jet.hpp"
 #include "varpin/mechanism.hpp"
 #include "varpin/spatial.hpp"

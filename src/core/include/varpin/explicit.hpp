@@ -208,6 +208,7 @@ class ExplicitRollout {
 
     std::vector<double> q, v;  // (P, n) present states of the paths
 
+    const Mechanism& mechanism() const { return *mechanism_; }
     std::int64_t paths() const { return paths_; }
     int dof() const { return mechanism_->dof(); }
     int abscissae() const { return stepper_.abscissae(); }

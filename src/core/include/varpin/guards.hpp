@@ -17,6 +17,7 @@
 #include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
 #include "varpin/kernels.hpp"
+#include "varpin/step_equation.hpp"
 
 namespace varpin {
 
@@ -49,6 +50,8 @@ struct Share {
 
 // The balance of a light part at a node; the carrier's L_q and L_v in all coordinates.
 struct PartLedger {
+    explicit PartLedger(int n) : Lq(n), Lv(n) {}
+
     double jacobi = 0.0;
     double potential = 0.0;
     double scale = 0.0;  // magnitude of their terms
@@ -59,12 +62,8 @@ struct PartLedger {
 
 // Energies of a path at its last node.
 struct Energies {
-    explicit Energies(const Tree& tree) : group(tree.groups), share(tree.dof()), part(tree.light_parts.size()) {
-        for (PartLedger& ledger : part) {
-            ledger.Lq.resize(tree.dof());
-            ledger.Lv.resize(tree.dof());
-        }
-    }
+    explicit Energies(const Tree& tree)
+        : group(tree.groups), share(tree.dof()), part(tree.light_parts.size(), PartLedger(tree.dof())) {}
     std::vector<Ledger> group;
     std::vector<Share> share;
     std::vector<PartLedger> part;
@@ -123,7 +122,7 @@ class EnergyGuard {
     }
 
     // Energies and the factors L D L' of M at q, in the lower triangles of blocks, if bodies are not articulated.
-    bool factor(const double* q) { return kernels.factor_mass(*this, q); }
+    bool factor(const double* q) { return (this->*kernels.factor_mass)(q); }
     const std::vector<double>& factors() const { return ldl; }
 
     // v = M^-1 p from the factors of `node`. The shares of the coordinates are the terms of the kinetic energy
@@ -133,7 +132,7 @@ class EnergyGuard {
         if (articulated) {
             articulated->solve(p, v, share.data());
         } else {
-            kernels.velocity(*this, p, v);
+            (this->*kernels.velocity)(p, v);
         }
         for (int i = 0; i < n; ++i) kinetic[mechanism.tree.group[i]] += share[i];
     }
@@ -184,8 +183,8 @@ class EnergyGuard {
             const double coupling = h * tableau.skew;
             return step.elimination->least_pivot_ratio(coupling, exaggerated, diagonal.data());
         }
-        if (step.stages == 1) return kernels.branch_margin(*this, h, guards, step);
-        return branch_margin_of(n, step.stages, h, guards, step);
+        if (step.stages == 1) return (this->*kernels.branch_margin)(h, guards, step);
+        return branch_margin_of<int, int>(h, guards, step);
     }
 
     // Velocity and energy at the end of a substep, and whether its energy balance closes; if so, updates the ledgers.
@@ -272,9 +271,39 @@ class EnergyGuard {
     std::vector<double> curved, mass;  // (n, n) of the branch guard, unless the step equation is solved by elimination
     std::vector<PartLedger> part;      // at the trial node
 
+    template <class Size>
+    bool factor_sized(const double* q) {
+        const Size n = this->n;
+        mass_matrix<Size>(mechanism, q, jet);
+        for (const Block& block : blocks_of(mechanism.tree, n)) {
+            for (int i = block.begin; i < block.end; ++i) {
+                const double* row = &jet.M[i * n];
+                std::copy(row + block.begin, row + i + 1, &ldl[i * n + block.begin]);
+            }
+            if (!factor_ldl(ldl.data(), n, block)) return false;
+        }
+        return true;
+    }
+
+    template <class Size>
+    void velocity_sized(const double* p, double* v) {
+        const Size n = this->n;
+        for (const Block& block : blocks_of(mechanism.tree, n)) {
+            solve_lower(ldl.data(), n, block, p, v);
+            for (int i = block.begin; i < block.end; ++i) {
+                const double y = v[i];
+                v[i] /= ldl[i * n + i];
+                share[i] = 0.5 * v[i] * y;
+            }
+            solve_upper(ldl.data(), n, block, v);
+        }
+    }
+
     // branch_margin from the matrices of the stages' jets.
     template <class Size, class Stages>
-    double branch_margin_of(Size n, Stages stages, double h, const Guards& guards, const Collocation& step) {
+    double branch_margin_of(double h, const Guards& guards, const Collocation& step) {
+        const Size n = this->n;
+        const Stages stages = step.stages;
         const Tableau& tableau = step.tableau;
         const double exaggerated = h * h * tableau.reach / (1.0 - guards.branch_margin);
         double least = infinity;
@@ -458,37 +487,18 @@ class EnergyGuard {
 };
 
 template <class Size>
-double Sized<Size>::branch_margin(EnergyGuard& guard, double h, const Guards& guards, const Collocation& step) {
-    return guard.branch_margin_of(Size(guard.n), Known<1>(1), h, guards, step);
-}
-
-template <class Size>
-bool Sized<Size>::factor_mass(EnergyGuard& guard, const double* q) {
-    const Size n = guard.n;
-    const Mechanism& mechanism = guard.mechanism;
-    double *M = guard.jet.M.data(), *ldl = guard.ldl.data();
-    mass_matrix<Size>(mechanism, q, guard.jet);
-    for (const Block& block : blocks_of(mechanism.tree, n)) {
-        for (int i = block.begin; i < block.end; ++i)
-            std::copy(M + i * n + block.begin, M + i * n + i + 1, ldl + i * n + block.begin);
-        if (!factor_ldl(ldl, n, block)) return false;
-    }
-    return true;
-}
-
-template <class Size>
-void Sized<Size>::velocity(EnergyGuard& guard, const double* p, double* v) {
-    const Size n = guard.n;
-    const double* ldl = guard.ldl.data();
-    for (const Block& block : blocks_of(guard.mechanism.tree, n)) {
-        solve_lower(ldl, n, block, p, v);
-        for (int i = block.begin; i < block.end; ++i) {
-            const double y = v[i];
-            v[i] /= ldl[i * n + i];
-            guard.share[i] = 0.5 * v[i] * y;
-        }
-        solve_upper(ldl, n, block, v);
-    }
-}
+const Kernels Sized<Size>::kernels{
+    .jet = &lagrangian_jet<Size, double>,
+    .first_order = &varpin::first_order<Size>,
+    .residuals = &Collocation::residuals_of<Size, Known<1>>,
+    .factor = &Collocation::factor_one<Size>,
+    .solve = &Collocation::solve_one<Size>,
+    .kinetic_size = &Collocation::kinetic_size_of_one<Size>,
+    .derivatives = &StepEquation::derivatives_by_blocks<Size, Known<1>>,
+    .branch_margin = &EnergyGuard::branch_margin_of<Size, Known<1>>,
+    .factor_mass = &EnergyGuard::factor_sized<Size>,
+    .velocity = &EnergyGuard::velocity_sized<Size>,
+    .velocity_slopes = &varpin::velocity_slopes<Size>,
+};
 
 }  // namespace varpin

@@ -20,8 +20,6 @@
 #include "varpin/dual.hpp"
 #include "varpin/elementary.hpp"
 #include "varpin/mechanism.hpp"
-#include "varpin/size.hpp"
-#include "varpin/slopes.hpp"
 #include "varpin/spatial.hpp"
 
 namespace varpin {

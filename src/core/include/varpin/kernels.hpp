@@ -9,7 +9,6 @@
 
 #include "varpin/dense.hpp"
 #include "varpin/jet.hpp"
-#include "varpin/size.hpp"
 
 namespace varpin {
 
@@ -49,44 +48,24 @@ void velocity_slopes(const Mechanism& mechanism, std::size_t rows, const double*
 struct Kernels {
     void (*jet)(const Mechanism& mechanism, const double* q, const double* v, Jet<double>& w);
     void (*first_order)(const Mechanism& mechanism, const double* q, const double* v, Jet<double>& w);
-    double (*residuals)(Collocation& step, double h, const Start& start);
-    bool (*factor)(Collocation& step, double h);
-    void (*solve)(const Collocation& step, const double* right, double* x);
-    double (*kinetic_size)(const Collocation& step, const double* x);
-    void (*derivatives)(StepEquation& step, double h, std::vector<double>& dV, double* Jx, double* Jf);
-    double (*branch_margin)(EnergyGuard& guard, double h, const Guards& guards, const Collocation& step);
-    bool (*factor_mass)(EnergyGuard& guard, const double* q);
-    void (*velocity)(EnergyGuard& guard, const double* p, double* v);
+    double (Collocation::*residuals)(double h, const Start& start);
+    bool (Collocation::*factor)(double h);
+    void (Collocation::*solve)(const double* right, double* x) const;
+    double (Collocation::*kinetic_size)(const double* x) const;
+    void (StepEquation::*derivatives)(double h, std::vector<double>& dV, double* Jx, double* Jf);
+    double (EnergyGuard::*branch_margin)(double h, const Guards& guards, const Collocation& step);
+    bool (EnergyGuard::*factor_mass)(const double* q);
+    void (EnergyGuard::*velocity)(const double* p, double* v);
     void (*velocity_slopes)(const Mechanism& mechanism, std::size_t rows, const double* q, const double* v,
                             double* slopes);
 };
 
-// What Kernels point to, in collocation.hpp, step_equation.hpp and guards.hpp.
+// Defined in guards.hpp, where all of them are known.
 template <class Size>
 struct Sized {
-    static double residuals(Collocation& step, double h, const Start& start);
-    static bool factor(Collocation& step, double h);
-    static void solve(const Collocation& step, const double* right, double* x);
-    static double kinetic_size(const Collocation& step, const double* x);
-    static void derivatives(StepEquation& step, double h, std::vector<double>& dV, double* Jx, double* Jf);
-    static double branch_margin(EnergyGuard& guard, double h, const Guards& guards, const Collocation& step);
-    static bool factor_mass(EnergyGuard& guard, const double* q);
-    static void velocity(EnergyGuard& guard, const double* p, double* v);
+    static const Kernels kernels;
 };
-
 template <class Size = int>
-inline constexpr Kernels kernels_for{
-    .jet = &lagrangian_jet<Size, double>,
-    .first_order = &first_order<Size>,
-    .residuals = &Sized<Size>::residuals,
-    .factor = &Sized<Size>::factor,
-    .solve = &Sized<Size>::solve,
-    .kinetic_size = &Sized<Size>::kinetic_size,
-    .derivatives = &Sized<Size>::derivatives,
-    .branch_margin = &Sized<Size>::branch_margin,
-    .factor_mass = &Sized<Size>::factor_mass,
-    .velocity = &Sized<Size>::velocity,
-    .velocity_slopes = &velocity_slopes<Size>,
-};
+inline constexpr const Kernels& kernels_for = Sized<Size>::kernels;
 
 }  // namespace varpin

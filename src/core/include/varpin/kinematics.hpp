@@ -145,6 +145,13 @@ Vec3<T> add_arms(const Links& links, const std::vector<int>& path, const Anchor&
     return x;
 }
 
+// Add a vector to three rows of a column; rows have n entries.
+inline void add_column(const Vec3<double>& a, int n, double* column) {
+    column[0] += a.x;
+    column[n] += a.y;
+    column[2 * n] += a.z;
+}
+
 // The Jacobian (6, n) of a frame at a point of the last body: linear, then angular velocity, in world axes.
 inline void frame_jacobian(const Links& links, const Placement* at, const Vec3<double>& point, double* J) {
     const int n = links.dof;
@@ -152,13 +159,8 @@ inline void frame_jacobian(const Links& links, const Placement* at, const Vec3<d
     for (int j = 0; j < links.size(); ++j) {
         const Body& link = links.bodies[j];
         const Motion<double> gives = given_by(link, at[j], point);
-        double* column = J + link.coordinate;
-        column[0] += link.ratio * gives.linear.x;
-        column[n] += link.ratio * gives.linear.y;
-        column[2 * n] += link.ratio * gives.linear.z;
-        column[3 * n] += link.ratio * gives.angular.x;
-        column[4 * n] += link.ratio * gives.angular.y;
-        column[5 * n] += link.ratio * gives.angular.z;
+        add_column(link.ratio * gives.linear, n, J + link.coordinate);
+        add_column(link.ratio * gives.angular, n, J + 3 * n + link.coordinate);
     }
 }
 
@@ -189,9 +191,7 @@ inline Vec3<double> center_of_mass(const Links& links, const Placement* at, Load
             const Vec3<double>& axis = at[j].rotation.z;
             const Vec3<double> momentum = link.prismatic ? mass * axis : cross(axis, moment - mass * at[j].position);
             const Vec3<double> gives = (link.ratio / all.mass) * momentum;
-            J[link.coordinate] += gives.x;
-            J[n + link.coordinate] += gives.y;
-            J[2 * n + link.coordinate] += gives.z;
+            add_column(gives, n, J + link.coordinate);
         }
     }
     return (1.0 / all.mass) * all.moment;

@@ -8,30 +8,19 @@
 
 #include <algorithm>
 #include <cstdint>
-#include <optional>
+#include <memory>
 #include <span>
-#include <utility>
 #include <vector>
 
-#include "varpin/sensitivities.hpp"
-#include "varpin/substeps.hpp"
-#include "varpin/variational.hpp"
+#include "varpin/repeated_steps.hpp"
 
 namespace varpin {
 
-class VariationalLinearization {
+class VariationalLinearization : public StepLinearization {
   public:
-    // With active guards, a part that they refuse is halved, since a step may need other parts without its noise.
-    // Without them, the parts are exactly those given.
     VariationalLinearization(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
                              const Kernels& kernels = kernels_for<>)
-        : stepper(mechanism, tableau, tolerance, guards, 1.0, kernels),
-          n(mechanism.dof()),
-          stages(tableau.stages),
-          state(mechanism, stages),
-          from(n),
-          from_p(n),
-          chained(n, n),
+        : StepLinearization(std::make_unique<VariationalStepper>(mechanism, tableau, tolerance, guards, 1.0, kernels)),
           direction(mechanism.tree),
           at_q(n),
           at_v(n),
@@ -39,43 +28,8 @@ class VariationalLinearization {
           along_q(n),
           along_v(n),
           along_f(n) {
+        dV.resize(entries(stages * n, 3 * n));
         for (int c = 0; c < n; ++c) df[c * 3 * n + 2 * n + c] = 1.0;
-    }
-
-    bool varies = false;  // each step has forces (s, n) at its stages instead of a constant force (n)
-
-    // Parameters in which `first` takes derivatives.
-    void take(std::vector<Parameter> parameters) {
-        columns.emplace(stepper.equation, std::move(parameters));
-        in_parameters.resize(entries(2 * n, columns->count()));
-    }
-    std::size_t parameters() const { return columns->parameters.size(); }
-
-    // Take derivatives in an external force (n), which acts beside f unless null, in the place of f, which drives
-    // limit.
-    void take_external(const double* force = nullptr) {
-        stepper.equation.by_external = true;
-        stepper.outer = force;
-    }
-
-    // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a force f, and unless null
-    // Jr (2n, n) in a force that grows linearly from 0 at the start of the step to f at its end, and Jp (2n, k) in the
-    // parameters. An undivided step
-    // is solved again from a guess (s, n) close to its root; the arrays q, p and force have `past` earlier steps before
-    // the pointers. A divided step has `halvings`: its parts are repeated, and their derivatives are multiplied.
-    Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
-                  std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past = 0, double* Jr = nullptr,
-                  double* Jp = nullptr) {
-        if (halvings.empty() && !stepper.guards.active) {
-            const Outcome outcome = root(h, q, p, guess, force, past);
-            if (outcome == Outcome::solved) {
-                stepper.equation.derivatives(h, dV, Jx, Jf);
-                if (Jr) ramp_derivatives(h, 0.0, 1.0, Jr);
-                if (Jp) parameter_derivatives(h, Jp);
-            }
-            return outcome;
-        }
-        return in_parts(h, q, p, force, halvings, Jx, Jf, Jr, Jp);
     }
 
     // Takes x = (q, p) to the end of a step, in the parts that the guards require, with its derivatives Jx in x and Jf
@@ -83,12 +37,12 @@ class VariationalLinearization {
     // becomes that of the jumps of p, which it is.
     Outcome step(double h, double* x, const double* force, const double* external, double* Jx, double* Jf, double*) {
         take_external(external);
-        stepper.take_force(force, varies);
-        Outcome outcome = stepper.step_from(h, x, x + n, state);
+        stepper->take_force(force, varies);
+        Outcome outcome = stepper->step_from(h, x, x + n, state);
         if (outcome == Outcome::solved) {
-            stepper.equation.derivatives(h, dV, Jx, Jf);
+            equation().derivatives(h, dV, Jx, Jf);
         } else {
-            outcome = in_parts(h, x, x + n, force, {}, Jx, Jf, nullptr);
+            outcome = in_parts({.h = h, .q = x, .p = x + n, .force = force}, {.state = Jx, .force = Jf});
         }
         std::copy(state.q.begin(), state.q.end(), x);
         std::copy(state.momentum.begin(), state.momentum.end(), x + n);
@@ -96,9 +50,8 @@ class VariationalLinearization {
     }
 
     // q1 and M(q1)^-1 p1 (n) of the step of which `first` gives the derivatives.
-    Outcome end(double h, const double* q, const double* p, const double* force, std::span<const std::uint8_t> halvings,
-                double* q1, double* v1) {
-        const Outcome outcome = parts(h, q, p, force, halvings, [](double, double) {});
+    Outcome end(const RepeatedStep& at, double* q1, double* v1) {
+        const Outcome outcome = parts(at, [](double, double) {});
         if (outcome != Outcome::solved) return outcome;
         std::copy(state.q.begin(), state.q.end(), q1);
         std::copy(state.v.begin(), state.v.end(), v1);
@@ -107,34 +60,35 @@ class VariationalLinearization {
 
     // v = M(q)^-1 p and its derivatives in x = (q, p), into zeros (n, 2n); false where M(q) is not positive definite.
     bool velocity(const double* x, double* v, double* slopes) {
-        if (!stepper.move_to(x, x + n, state)) return false;
+        if (!stepper->move_to(x, x + n, state)) return false;
         std::copy(state.v.begin(), state.v.end(), v);
-        stepper.equation.kernels.velocity_slopes(stepper.mechanism, 1, x, v, slopes);
+        equation().kernels.velocity_slopes(stepper->mechanism, 1, x, v, slopes);
         return true;
     }
 
     // z . d2(q1, p1)/d(q0, p0, f)2 of one step, into H (3n, 3n). For a divided step, z is propagated backward by the
     // derivative of each part, and the second derivatives of each part are transformed to the start of the step.
-    Outcome second(double h, const double* q, const double* p, const double* guess, const double* force,
-                   std::span<const std::uint8_t> halvings, const double* z, double* H, int past = 0) {
+    Outcome second(const RepeatedStep& at, const double* z, double* H) {
         std::fill(H, H + entries(3 * n, 3 * n), 0.0);
-        if (halvings.empty() && !stepper.guards.active) {
-            const Outcome outcome = root(h, q, p, guess, force, past);
+        if (at.halvings.empty() && !stepper->guards.active) {
+            const Outcome outcome = root(at);
             if (outcome != Outcome::solved) return outcome;
-            part_derivatives(h);
-            add_curvature(h, z, nullptr, H);
+            differentiate(at.h, 0.0, 1.0, chained.part);
+            add_curvature(at.h, z, nullptr, H);
             return Outcome::solved;
         }
         std::vector<Substep> trail;
         std::vector<double> row(z, z + 2 * n), before(2 * n);
-        const Outcome outcome = follow(h, q, p, force, halvings, trail);
+        const Outcome outcome = follow(at, trail);
         if (outcome != Outcome::solved) return outcome;
         for (std::size_t k = trail.size(); k-- > 0;) {
-            const Outcome again = root_of(h, trail[k]);
-            if (again != Outcome::solved) return again;
-            part_derivatives(trail[k].length);
-            add_curvature(trail[k].length, row.data(), trail[k].start.data(), H);
-            back(row.data(), before.data());
+            const Substep& part = trail[k];
+            stepper->force_in_part(part.begin, part.length / at.h);
+            const Outcome solved = solve(part.length, part.V.data(), part.position, part.p);
+            if (solved != Outcome::solved) return solved;
+            differentiate(part.length, part.begin, part.length / at.h, chained.part);
+            add_curvature(part.length, row.data(), part.start.data(), H);
+            detail::multiply(row.data(), chained.part.state, 1, 2 * n, 2 * n, before.data());
             std::swap(before, row);
         }
         return Outcome::solved;
@@ -154,18 +108,7 @@ class VariationalLinearization {
         std::vector<double> start;  // (2n, 3n) derivatives from the start of the step to its own
     };
 
-    VariationalStepper stepper;
-    int n;
-    int stages;
-    PathState state;
-    std::vector<Coordinate> from;  // where the last part began
-    std::vector<Compensated> from_p;
-    std::vector<double> dV = zeros(stages * n, 3 * n);
     std::vector<double> dQ = zeros(n, 3 * n);  // of one stage
-    ChainedDerivatives chained;
-    std::optional<ParameterColumns> columns;
-    std::vector<double> in_parameters;                  // (2n, k) of a part
-    std::vector<double> in_ramp = zeros(2 * n, 2 * n);  // derivatives in the state again, which nobody reads
     std::vector<double> multiplier = zeros(stages, n), slope = zeros(stages, n);
     Jet<Dual> direction;
     std::vector<Dual> at_q, at_v;
@@ -175,103 +118,59 @@ class VariationalLinearization {
     std::vector<Dual> coupled_q, coupled_v;                   // (n, n) of couplings, along a direction
     std::vector<JointForce<Dual>> along_q, along_v, along_f;  // (n) of the elements, with derivatives in q, in v, in f
 
-    Outcome in_parts(double h, const double* q, const double* p, const double* force,
-                     std::span<const std::uint8_t> halvings, double* Jx, double* Jf, double* Jr, double* Jp = nullptr) {
-        chained.begin(Jx, Jf);
-        if (Jr) std::fill(Jr, Jr + entries(2 * n, n), 0.0);
-        if (Jp) std::fill(Jp, Jp + in_parameters.size(), 0.0);
-        return parts(h, q, p, force, halvings, [&](double begin, double length) {
-            part_derivatives(length);
-            chained.follow(Jx, Jf);
-            if (Jp) {
-                parameter_derivatives(length, in_parameters.data());
-                chained.follow_more(Jp, in_parameters);
-            }
-            if (!Jr) return;
-            ramp_derivatives(length, begin, length / h, chained.part_rate.data());
-            chained.follow_rates(Jr);
-        });
-    }
+    StepEquation& equation() { return stepper->equation; }
 
-    // The root of an undivided step, from a guess (s, n). If the guess is too far away, for example because friction
-    // changes its sign within the step, from the initial velocity, and then by repetition of the steps before.
-    Outcome root(double h, const double* q, const double* p, const double* guess, const double* force, int past) {
-        std::copy(guess, guess + stages * n, stepper.equation.V.begin());
-        Outcome outcome = root_at(h, q, p, force);
+    // From a guess (s, n). If the guess is too far away, for example because friction changes its sign within the step,
+    // from the initial velocity, and then by repetition of the steps before.
+    Outcome root(const RepeatedStep& at) override {
+        Outcome outcome = root_from(at, at.guess);
         if (outcome == Outcome::solved) return outcome;
-        if (!stepper.begin_at(q, p, state)) return Outcome::singular;
-        outcome = stepper.part(h, 0, 0.0, state);
-        if (outcome == Outcome::solved || past == 0) return outcome;
+        if (!stepper->begin_at(at.q, at.p, state)) return Outcome::singular;
+        outcome = stepper->part(at.h, 0, 0.0, state);
+        if (outcome == Outcome::solved || at.past == 0) return outcome;
         const Outcome alone = outcome;
-        if (!stepper.begin_at(q - past * n, p - past * n, state)) return alone;
-        for (int k = past; k >= 0; --k) {
-            stepper.take_force(force - k * (varies ? stages * n : n), varies);
-            if (stepper.step(h, state) != Outcome::solved) return alone;
+        if (!stepper->begin_at(at.q - at.past * n, at.p - at.past * n, state)) return alone;
+        for (int k = at.past; k >= 0; --k) {
+            stepper->take_force(at.force - k * (varies ? stages * n : n), varies);
+            if (stepper->step(at.h, state) != Outcome::solved) return alone;
         }
-        return root_at(h, q, p, force);
+        const std::vector<double> last = equation().V;
+        return root_from(at, last.data());
     }
 
-    // The root from the guess in the step equation.
-    Outcome root_at(double h, const double* q, const double* p, const double* force) {
-        for (int i = 0; i < n; ++i) {
-            state.position[i] = {{q[i], 0.0}, 0.0};
-            stepper.unwind(i, state);
-            state.p[i] = {p[i], 0.0};
-        }
-        stepper.take_force(force, varies);
-        return stepper.equation.solve(h, {state.position.data(), state.p.data(), stepper.force.data(), stepper.stride},
-                                      loose, true, stepper.effort);
+    Outcome root_from(const RepeatedStep& at, const double* V) {
+        stepper->place(at.q, at.p, state);
+        stepper->take_force(at.force, varies);
+        return solve(at.h, V, state.position, state.p);
     }
 
-    Outcome root_of(double h, const Substep& part) {
-        stepper.force_in_part(part.begin, part.length / h);
-        std::copy(part.V.begin(), part.V.end(), stepper.equation.V.begin());
-        return stepper.equation.solve(part.length,
-                                      {part.position.data(), part.p.data(), stepper.force.data(), stepper.stride},
-                                      loose, true, stepper.effort);
-    }
-
-    // Repeat the parts of a step. After each solved part, with its root in the stepper, calls visit(begin, length),
-    // with the begin in units of the step.
-    template <class Visit>
-    Outcome parts(double h, const double* q, const double* p, const double* force,
-                  std::span<const std::uint8_t> halvings, const Visit& visit) {
-        stepper.take_force(force, varies);
-        if (!stepper.begin_at(q, p, state)) return Outcome::singular;
-        return parts_again(halvings, stepper.guards.halvings_again(), [&](int level, double begin) {
-            from = state.position;
-            from_p = state.p;
-            const Outcome outcome = stepper.part(h, level, begin, state);
-            if (outcome == Outcome::solved) visit(begin, length_of(h, level));
-            return outcome;
-        });
+    // The root from stage velocities V (s, n) that are close to it.
+    Outcome solve(double h, const double* V, const std::vector<Coordinate>& position,
+                  const std::vector<Compensated>& p) {
+        std::copy(V, V + stages * n, equation().V.begin());
+        const Start start{position.data(), p.data(), stepper->force.data(), stepper->stride};
+        return equation().solve(h, start, loose, true, stepper->effort);
     }
 
     // The parts of a step, repeated.
-    Outcome follow(double h, const double* q, const double* p, const double* force,
-                   std::span<const std::uint8_t> halvings, std::vector<Substep>& trail) {
+    Outcome follow(const RepeatedStep& at, std::vector<Substep>& trail) {
         std::vector<double> Jx(4 * n * n), Jf(2 * n * n);
-        chained.begin(Jx.data(), Jf.data());
-        return parts(h, q, p, force, halvings, [&](double begin, double length) {
-            trail.push_back({from, from_p, stepper.equation.V, begin, length, joined(Jx, Jf)});
-            part_derivatives(length);
-            chained.follow(Jx.data(), Jf.data());
+        const StepDerivatives to{.state = Jx.data(), .force = Jf.data()};
+        chained.begin(to);
+        return parts(at, [&](double begin, double length) {
+            trail.push_back({from, from_p, equation().V, begin, length, joined(Jx, Jf)});
+            differentiate(length, begin, length / at.h, chained.part);
+            chained.follow(to);
         });
     }
 
-    // A row (2n) on the end of a part, brought to its beginning by the part's derivatives.
-    void back(const double* row, double* before) const {
-        for (int c = 0; c < 2 * n; ++c) {
-            before[c] = 0.0;
-            for (int r = 0; r < 2 * n; ++r) before[c] += chained.part[r * 2 * n + c] * row[r];
-        }
-    }
-
-    // Derivatives (2n, n) in a ramp of the force over the whole step, of the part whose root is in the stepper.
-    void ramp_derivatives(double h, double begin, double share, double* Jr) {
-        stepper.equation.weigh_ramp(begin, share);
-        stepper.equation.derivatives(h, dV, in_ramp.data(), Jr);
-        stepper.equation.weigh_constant();
+    void differentiate(double h, double begin, double share, const StepDerivatives& to) override {
+        equation().derivatives(h, dV, to.state, to.force);
+        if (to.parameters) parameter_derivatives(h, to.parameters);
+        if (!to.ramp) return;
+        equation().weigh_ramp(begin, share);
+        equation().derivatives(h, dV, again.data(), to.ramp);
+        equation().weigh_constant();
     }
 
     // Derivatives (2n, k) in the parameters, of the part whose root and factors are in the stepper.
@@ -279,20 +178,15 @@ class VariationalLinearization {
         const int k = columns->count();
         std::vector<double> right, dp, dq(n), by(stages * n);
         for (int a = 0; a < k; ++a) {
-            columns->right_side(a, h, stepper.force.data(), stepper.stride, right, dp);
-            stepper.equation.solve_factored(right.data(), by.data());
+            columns->right_side(a, h, stepper->force.data(), stepper->stride, right, dp);
+            equation().solve_factored(right.data(), by.data());
             std::fill(dq.begin(), dq.end(), 0.0);
-            stepper.equation.add_end_change(h, by.data(), dq.data(), dp.data());
+            equation().add_end_change(h, by.data(), dq.data(), dp.data());
             for (int r = 0; r < n; ++r) {
                 Jp[r * k + a] = dq[r];
                 Jp[(n + r) * k + a] = dp[r];
             }
         }
-    }
-
-    // Derivatives of the part whose root is in the stepper.
-    void part_derivatives(double length) {
-        stepper.equation.derivatives(length, dV, chained.part.data(), chained.part_f.data());
     }
 
     std::vector<double> joined(const std::vector<double>& Jx, const std::vector<double>& Jf) const {
@@ -304,20 +198,20 @@ class VariationalLinearization {
         return both;
     }
 
-    // Add start' (z . d2(q1, p1)) start, (L4), at the stepper's root, after part_derivatives; `start` (2n, 3n) may be
+    // Add start' (z . d2(q1, p1)) start, (L4), at the stepper's root, after `differentiate`; `start` (2n, 3n) may be
     // null.
     void add_curvature(double h, const double* z, const double* start, double* H) {
-        const Collocation& equation = stepper.equation;
+        const Collocation& equation = stepper->equation;
         const int w = 3 * n;
         write_slopes(h, z);
-        stepper.equation.solve_transposed(slope.data(), multiplier.data());
+        stepper->equation.solve_transposed(slope.data(), multiplier.data());
         if (start != nullptr) bring_to_start(start);
         for (int i = 0; i < stages; ++i) {
             differentiate_along(h, i, z);
             move_stage(h, i, start);
             std::fill(inner.begin(), inner.end(), 0.0);
             bend_stage(i);
-            if (stepper.mechanism.forces.any()) add_elements(h, i, z, H + 2 * n * w);
+            if (stepper->mechanism.forces.any()) add_elements(h, i, z, H + 2 * n * w);
             if (equation.coupled()) add_couplings(h, i, z);
             for (int c = 0; c < n; ++c) {
                 const double *dq = &dQ[c * w], *dv = &dV[(i * n + c) * w];
@@ -335,7 +229,7 @@ class VariationalLinearization {
 
     // dphi/dV_m = h b_m (zq + (A_m + F_v,m) zp) + h^2 sum_i b_i a_im (L_qq,i + F_q,i) zp into `slope`.
     void write_slopes(double h, const double* z) {
-        const Collocation& equation = stepper.equation;
+        const Collocation& equation = stepper->equation;
         const Tableau& tableau = equation.tableau;
         for (int m = 0; m < stages; ++m) {
             for (int c = 0; c < n; ++c) {
@@ -357,7 +251,7 @@ class VariationalLinearization {
 
     // The jet at stage i and its derivative along (alpha, -multiplier), of which psi is the Lagrangian's share.
     void differentiate_along(double h, int i, const double* z) {
-        const Collocation& equation = stepper.equation;
+        const Collocation& equation = stepper->equation;
         const Tableau& tableau = equation.tableau;
         for (int c = 0; c < n; ++c) {
             double alpha = tableau.b[i] * z[n + c];
@@ -365,12 +259,12 @@ class VariationalLinearization {
             at_q[c] = {equation.Q[i * n + c], h * alpha};
             at_v[c] = {equation.V[i * n + c], -multiplier[i * n + c]};
         }
-        lagrangian_jet(stepper.mechanism, at_q.data(), at_v.data(), direction);
+        lagrangian_jet(stepper->mechanism, at_q.data(), at_v.data(), direction);
     }
 
     // Derivatives of Q at stage i into dQ.
     void move_stage(double h, int i, const double* start) {
-        const Tableau& tableau = stepper.equation.tableau;
+        const Tableau& tableau = stepper->equation.tableau;
         const int w = 3 * n;
         for (int c = 0; c < n; ++c) {
             for (int k = 0; k < w; ++k) {
@@ -400,14 +294,14 @@ class VariationalLinearization {
 
     // The elements' forces at stage i, with derivatives in q, in v and in f.
     void differentiate_elements(int i) {
-        const Collocation& equation = stepper.equation;
+        const Collocation& equation = stepper->equation;
         for (auto* along : {&along_q, &along_v, &along_f}) {
             for (int c = 0; c < n; ++c) {
                 at_q[c] = {equation.Q[i * n + c], along == &along_q ? 1.0 : 0.0};
                 at_v[c] = {equation.V[i * n + c], along == &along_v ? 1.0 : 0.0};
-                at_f[c] = {stepper.force[i * stepper.stride + c], along == &along_f ? 1.0 : 0.0};
+                at_f[c] = {stepper->force[i * stepper->stride + c], along == &along_f ? 1.0 : 0.0};
             }
-            stepper.mechanism.forces.sum(n, at_q.data(), at_v.data(), at_f.data(), along->data());
+            stepper->mechanism.forces.sum(n, at_q.data(), at_v.data(), at_f.data(), along->data());
         }
     }
 
@@ -432,7 +326,7 @@ class VariationalLinearization {
 
     // The weight gamma of the force of stage i on coordinate c.
     double weight(double h, int i, int c, const double* z) const {
-        const Tableau& tableau = stepper.equation.tableau;
+        const Tableau& tableau = stepper->equation.tableau;
         double gamma = tableau.b[i] * z[n + c];
         for (int j = 0; j < stages; ++j) gamma += tableau.force[j * stages + i] * multiplier[j * n + c];
         return h * gamma;
@@ -440,7 +334,7 @@ class VariationalLinearization {
 
     // Add the second derivatives of gamma . F of couplings at stage i, by columns of the Hessian.
     void add_couplings(double h, int i, const double* z) {
-        const Collocation& equation = stepper.equation;
+        const Collocation& equation = stepper->equation;
         const int w = 3 * n;
         for (auto* matrix : {&coupled_q, &coupled_v}) matrix->resize(n * n);
         for (int along = 0; along < 2 * n; ++along) {
@@ -449,8 +343,8 @@ class VariationalLinearization {
                 at_v[c] = {equation.V[i * n + c], n + c == along ? 1.0 : 0.0};
             }
             std::fill(along_q.begin(), along_q.end(), JointForce<Dual>{});
-            stepper.mechanism.couplings.add_forces(n, at_q.data(), at_v.data(), direction.couplings, along_q.data(),
-                                                   coupled_q.data(), coupled_v.data());
+            stepper->mechanism.couplings.add_forces(n, at_q.data(), at_v.data(), direction.couplings, along_q.data(),
+                                                    coupled_q.data(), coupled_v.data());
             const double* change = along < n ? &dQ[along * w] : &dV[(i * n + along - n) * w];
             for (int c = 0; c < n; ++c) {
                 double by_q = 0.0, by_v = 0.0;
@@ -474,10 +368,7 @@ class VariationalLinearization {
         std::vector<double> row(w);
         for (int k = 0; k < stages * n; ++k) {
             double* own = &dV[k * w];
-            std::fill(row.begin(), row.end(), 0.0);
-            for (int j = 0; j < 2 * n; ++j) {
-                for (int c = 0; c < w; ++c) row[c] += own[j] * start[j * w + c];
-            }
+            detail::multiply(own, start, 1, 2 * n, w, row.data());
             for (int c = 2 * n; c < w; ++c) row[c] += own[c];
             std::copy(row.begin(), row.end(), own);
         }

@@ -19,7 +19,7 @@ struct Diffusion {
     std::vector<double> control;    // (n, k, m)
     std::vector<double> quadratic;  // (n, k)
     std::vector<double> center;     // (n, k) [rad or m]
-    std::vector<int> sloped;        // the processes whose strength depends on the control
+    std::vector<int> sloped{};      // the processes whose strength depends on the control
 };
 
 // A nonzero entry of B, generalized force per unit of a control.

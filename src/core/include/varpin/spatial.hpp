@@ -80,39 +80,27 @@ constexpr Sym3<T> rotated(const Mat3<T>& R, const Sym3<double>& I) {
     return {dot(t.x, r.x), dot(t.x, r.y), dot(t.y, r.y), dot(t.x, r.z), dot(t.y, r.z), dot(t.z, r.z)};
 }
 
-template <class T>
-struct Motion {
+// A motion or a force, which are not to be confused.
+template <class T, class Kind>
+struct Six {
     Vec3<T> linear{}, angular{};
 };
-
 template <class T>
-struct Force {
-    Vec3<T> linear{}, angular{};
-};
-
+using Motion = Six<T, struct IsMotion>;
 template <class T>
-constexpr Motion<T> operator+(const Motion<T>& a, const Motion<T>& b) {
+using Force = Six<T, struct IsForce>;
+
+template <class T, class Kind>
+constexpr Six<T, Kind> operator+(const Six<T, Kind>& a, const Six<T, Kind>& b) {
     return {a.linear + b.linear, a.angular + b.angular};
 }
-template <class T>
-constexpr Motion<T>& operator+=(Motion<T>& a, const Motion<T>& b) {
+template <class T, class Kind>
+constexpr Six<T, Kind>& operator+=(Six<T, Kind>& a, const Six<T, Kind>& b) {
     return a = a + b;
 }
-template <class T>
-constexpr Motion<T> operator*(const T& s, const Motion<T>& a) {
+template <class T, class Kind>
+constexpr Six<T, Kind> operator*(const T& s, const Six<T, Kind>& a) {
     return {s * a.linear, s * a.angular};
-}
-template <class T>
-constexpr Force<T> operator+(const Force<T>& a, const Force<T>& b) {
-    return {a.linear + b.linear, a.angular + b.angular};
-}
-template <class T>
-constexpr Force<T> operator*(const T& s, const Force<T>& f) {
-    return {s * f.linear, s * f.angular};
-}
-template <class T>
-constexpr Force<T>& operator+=(Force<T>& a, const Force<T>& b) {
-    return a = a + b;
 }
 template <class T, class U>
 constexpr auto dot(const Motion<T>& a, const Force<U>& f) -> decltype(a.linear.x * f.linear.x) {

@@ -33,14 +33,16 @@ class StepEquation : public Collocation {
     // Derivatives at the root, from the jets of its stages: dV (s, n, 3n), and of (q1, p1), all in (q0, p0, f); Jx is
     // (2n, 2n), Jf (2n, n). Only blocks of dV are written.
     void derivatives(double h, std::vector<double>& dV, double* Jx, double* Jf) {
-        if (stages == 1) return kernels.derivatives(*this, h, dV, Jx, Jf);
-        derivatives_by_blocks(n, stages, h, dV, Jx, Jf);
+        if (stages == 1) return (this->*kernels.derivatives)(h, dV, Jx, Jf);
+        derivatives_by_blocks<int, int>(h, dV, Jx, Jf);
     }
 
     // The same. Numbers of joints and stages may be known at compile time, here and in
     // the three parts of it.
     template <class Size, class Stages>
-    void derivatives_by_blocks(Size n, Stages stages, double h, std::vector<double>& dV, double* Jx, double* Jf) {
+    void derivatives_by_blocks(double h, std::vector<double>& dV, double* Jx, double* Jf) {
+        const Size n = this->n;
+        const Stages stages = this->stages;
         const auto& blocks = blocks_of(mechanism.tree, n);
         if (blocks.size() > 1) {
             std::fill(Jx, Jx + 4 * n * n, 0.0);
@@ -233,10 +235,5 @@ class StepEquation : public Collocation {
         }
     }
 };
-
-template <class Size>
-void Sized<Size>::derivatives(StepEquation& step, double h, std::vector<double>& dV, double* Jx, double* Jf) {
-    step.derivatives_by_blocks(Size(step.n), Known<1>(1), h, dV, Jx, Jf);
-}
 
 }  // namespace varpin

@@ -2,6 +2,7 @@
 // docs/mathematics.md, "The Lagrangian jet".
 #pragma once
 
+#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <limits>
@@ -45,11 +46,32 @@ struct Tree {
     std::vector<char> periodic;    // (n) whether the Lagrangian without elements is periodic in a whole turn
     std::vector<int> group;        // (n) mechanically independent group of a coordinate
     int groups = 0;
-    std::vector<Block> blocks;  // in order; they cover all coordinates
-    std::vector<LightPart> light_parts;
+    std::vector<Block> blocks{};  // in order; they cover all coordinates
+    std::vector<LightPart> light_parts{};
 
     int dof() const { return static_cast<int>(armature.size()); }
     int size() const { return static_cast<int>(bodies.size()); }
 };
+
+// A size known at compile time, in the place of an int: the compiler unrolls loops, with the same code. docs/core.md,
+// "Processors".
+template <int count>
+struct Known {
+    constexpr Known(int) {}
+    constexpr operator int() const { return count; }
+};
+
+// Bodies and blocks of a tree of n coordinates. With n known at compile time, each body has a coordinate of its own,
+// and all coordinates form one block.
+inline int bodies_of(const Tree& tree, int) { return tree.size(); }
+inline const std::vector<Block>& blocks_of(const Tree& tree, int) { return tree.blocks; }
+template <int n>
+constexpr int bodies_of(const Tree&, Known<n>) {
+    return n;
+}
+template <int n>
+constexpr std::array<Block, 1> blocks_of(const Tree&, Known<n>) {
+    return {Block{0, n}};
+}
 
 }  // namespace varpin

@@ -98,7 +98,7 @@ inline void record_node(const PathState& state, int n, const Nodes& nodes, std::
     nodes.quality[3 * row + 2] = state.energies.defect();
 }
 
-// With the kernels of a number of joints, the mechanism has to be an arm of so many in a single block (size.hpp).
+// With the kernels of a number of joints, the mechanism has to be an arm of so many in a single block (tree.hpp).
 class VariationalStepper {
   public:
     VariationalStepper(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
@@ -172,6 +172,17 @@ class VariationalStepper {
         if (varies) given = force;
         take_goals(1);
         if (rates) take_rates(rates);
+    }
+
+    // Put a path at (q, p).
+    void place(const double* q, const double* p, PathState& state) const {
+        for (int i = 0; i < n; ++i) {
+            state.position[i] = {{q[i], 0.0}, 0.0};
+            unwind(i, state);
+            state.q[i] = q[i];
+            state.p[i] = {p[i], 0.0};
+            state.momentum[i] = p[i];
+        }
     }
 
     // Move a path to (q, p); false where M(q) is not positive definite. Its past stays, for guesses.
@@ -284,16 +295,6 @@ class VariationalStepper {
           m(rows),
           stages(tableau.stages),
           trial(n) {}
-
-    void place(const double* q, const double* p, PathState& state) const {
-        for (int i = 0; i < n; ++i) {
-            state.position[i] = {{q[i], 0.0}, 0.0};
-            unwind(i, state);
-            state.q[i] = q[i];
-            state.p[i] = {p[i], 0.0};
-            state.momentum[i] = p[i];
-        }
-    }
 
     // What differs under constraints.
 
