@@ -28,7 +28,6 @@ from varpin.control.multipliers import Multipliers, flat, split
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.qp import Minimum, Program, changes
 from varpin.control.riccati import Plan, backward, foreseen, noise_shares
-from varpin.control.rollout import around
 from varpin.control.second_order import curvature_along
 from varpin.control.sizes import FEASIBLE, HARMLESS, NOTABLE, ROUNDING, SLIGHT, TRACE
 from varpin.control.solution import Solution
@@ -534,13 +533,18 @@ class Search:
                 there = np.isfinite(limit) & (sign * (aim - limit) >= -TRACE * np.abs(limit))
                 u, gains = np.where(there, limit, u), np.where(there[:, :, None], 0.0, gains)
                 previous = None if previous is None else np.where(there[:, :, None], 0.0, previous)
-        x = states(problem, self.trajectory)[: -1 : problem.hold]
-        commands = around(problem, now, x, gains, previous)._replace(u=u)
-        if problem.linear:
-            # The first control has no feedback: its state is given.
-            first = problem.begun(np.clip(u[:1], *problem.control_limits))
-            commands = commands._replace(u=u[1:], before=first)
-        return commands
+        x, before = states(problem, self.trajectory)[: -1 : problem.hold], np.zeros((0, len(now[0])))
+        if previous is not None:
+            # The control before the first one is given.
+            x = np.hstack([x, now[:-1] if problem.linear else np.vstack([now[:1], now[:-1]])])
+            gains = np.concatenate([gains, previous], axis=2)
+        commands = Commands(u, gains, x, problem.hold, problem.control_limits, before)
+        if not problem.linear:
+            return commands
+        # The first control has no feedback: its state is given.
+        first = problem.begun(np.clip(u[:1], *problem.control_limits))
+        times = np.array(problem.integrator.stage_times or (0.5,))
+        return commands._replace(u=u[1:], gains=gains[1:], before=first, stage_times=times)
 
     def _violations(self, motion: Trajectory) -> list[Floats]:
         """Violations (P,) of all rows on a motion, margins included, in tenths of ranges."""

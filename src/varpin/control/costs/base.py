@@ -127,11 +127,6 @@ class Cost(Frozen, ABC):
     at_end: bool = False
     of_controls: bool = False
 
-    @property
-    def timed(self) -> bool:
-        """Whether the result of :meth:`bind` depends on the points' times, not only on their number."""
-        return True
-
     @abstractmethod
     def bind(self, points: Points) -> BoundCost:
         """Bind the cost to given points, without its ``factor``.

@@ -36,10 +36,6 @@ class _Quadratic(LeastSquares):
         self.weight = weight if isinstance(weight, Mapping) else checked_weight(name, weight)
         self.reference = reference if isinstance(reference, Mapping) else checked_reference(name, reference)
 
-    @property
-    def timed(self) -> bool:
-        return callable(self.reference) or (isinstance(self.reference, np.ndarray) and self.reference.ndim > 1)
-
     def bind(self, points: Points) -> BoundCost:
         name, of_controls = type(self).__name__, self._block == 2
         size = points.controls if of_controls else points.dof
@@ -108,7 +104,6 @@ class ControlCost(_Quadratic):
 class _Barrier(LeastSquares):
     weight: Floats
     limits: Floats
-    timed = False
     _block: int
 
     def __init__(

@@ -49,10 +49,6 @@ class _TaskCost(LeastSquares):
     def _place(self) -> FrameKinematics | Links:
         return frame_kinematics(self.robot, self.frame)
 
-    @property
-    def timed(self) -> bool:
-        return callable(self.target) or np.ndim(self.target) > len(self.shape)
-
     def bind(self, points: Points) -> BoundTerm:
         name = type(self).__name__
         require_same(name, self.robot, points.robot)
