@@ -55,8 +55,8 @@ def run_over(given, end_gradient, end_hessian, *, roots, hold=1, regularization=
     """(-1 or the decision without a minimum, what the pass filled in, the pass)."""
     m, gains, more = given["B"].shape[2], empty(given, hold), {}
     if roots:
-        run = core.RootPass(m, squares_of(end_gradient[None], end_hessian[None]).core, end_gradient)
-        more["running"] = squares_of(given["gradient"], given["hessian"]).core
+        run = core.RootPass(m, squares_of(end_gradient[None], end_hessian[None]), end_gradient)
+        more["running"] = squares_of(given["gradient"], given["hessian"])
     else:
         run = core.BackwardPass(m, end_gradient, end_hessian)
     return run.run(h, hold, regularization, **given, **gains, **more), gains, run

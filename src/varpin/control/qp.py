@@ -15,7 +15,7 @@ import scipy.sparse as sp
 from varpin.arrays import Floats, Integers
 from varpin.control.riccati import Plan
 from varpin.control.sizes import FEASIBLE, HARMLESS, ROUNDING, TENTH
-from varpin.control.stages import Rows, Stages
+from varpin.control.stages import Rows, Steps
 
 # Residuals at which the solver stops, absolute for a cost of gradient one, and relative; from 1e-12 to 1e-10.
 _RESIDUAL = 1e-11
@@ -35,7 +35,7 @@ class Program:
     """The program (O10) of one motion; :meth:`minimum` solves it, with other values of its rows for corrections."""
 
     def __init__(
-        self, stages: Stages, rows: Sequence[Rows], limits: tuple[Floats, Floats], plan: Plan, regularization: float
+        self, steps: Steps, rows: Sequence[Rows], limits: tuple[Floats, Floats], plan: Plan, regularization: float
     ) -> None:
         """Assemble the matrices.
 
@@ -44,14 +44,14 @@ class Program:
         constant, and the solver has neither large multipliers nor far apart weights to cope with.
 
         Args:
-            stages: The stages.
+            steps: The steps of the motion.
             rows: The rows of all constraints.
             limits: Least and greatest changes of the controls, each (R, m).
             plan: A backward pass along the motion, of the costs alone.
             regularization: A further cost of half the squares of the controls' changes, relative to the diagonal of
                 Quu.
         """
-        layout = stages.layout
+        layout = steps.layout
         self._layout, self._equalities = layout, [row.equality for row in rows]
         self._forms: dict[float | None, _Form] = {}  # by the weight of the rows
         at, beside = layout.decisions(plan.feedback, plan.previous)
@@ -76,7 +76,7 @@ class Program:
         after = layout.state(k + 1)
         numbers = np.arange(after.size).reshape(after.shape)
         self._hessian = _rectangle(at, at, hessian / self._scale)
-        self._dynamics = [_rectangle(numbers, layout.in_stage(k), stages.J), (numbers, after, -np.ones(after.shape))]
+        self._dynamics = [_rectangle(numbers, layout.in_stage(k), steps.J), (numbers, after, -np.ones(after.shape))]
         self._rows = [(row.at, row.slopes) for row in rows]
 
     def minimum(

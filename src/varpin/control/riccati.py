@@ -7,7 +7,6 @@ squares (1/2) |R x + r|^2, without its Hessian R'R: see ``square_root.hpp`` in `
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,10 +15,9 @@ from varpin import core
 from varpin.arrays import Floats, Mask
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.sizes import HARMLESS, ROUNDING
-from varpin.control.stages import Layout, Recursion, Steps
+from varpin.control.stages import Recursion, Steps
 from varpin.integrators.base import noise_fields
 from varpin.linearization import velocity_at_nodes, velocity_curvature
-from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
 
 
@@ -94,11 +92,12 @@ def _pass(steps: Steps, given: Recursion, regularization: float, *, second: bool
     arrays: dict[str, Any] = {**given_arrays, **found_arrays, "spread": spread, "factors": factors}
     found: core.BackwardPass | core.RootPass
     if roots:
-        final, running = squares_of(end.cost.gradient, end.cost.hessian), squares_of(given.gradient, given.hessian)
+        final = squares_of(end.cost.gradient, end.cost.hessian, end.slopes, X - x)
+        running = squares_of(given.gradient, given.hessian)
         if final is None or running is None:
             return None
-        found = core.RootPass(m, final.after(end.slopes).padded(X).core, gradient)
-        failed = found.run(problem.dt, problem.hold, float(regularization), running=running.core, **arrays)
+        found = core.RootPass(m, final, gradient)
+        failed = found.run(problem.dt, problem.hold, float(regularization), running=running, **arrays)
     else:
         found = core.BackwardPass(m, gradient, hessian)
         failed = found.run(problem.dt, problem.hold, float(regularization), **arrays)
@@ -118,7 +117,7 @@ def foreseen(steps: Steps, plan: Plan) -> tuple[Floats, bool]:
     Also whether a control reaches a limit.
     """
     problem, given = steps.problem, steps.recursion(None, None)
-    (S, X, _), layout = given.J.shape, Layout.of(problem)
+    (S, X, _), layout = given.J.shape, steps.layout
     R, m = plan.feedforward.shape
     slack = steps.slack if problem.limited else np.zeros((0, 2, m))
     moves, after = np.empty((R, m)), np.empty((S, X))
@@ -148,35 +147,12 @@ def noise_shares(problem: OptimalControlProblem, motion: Trajectory, plan: Plan)
     return added
 
 
-@dataclass(frozen=True, eq=False)
-class Squares(Frozen):
-    """N convex functions (1/2) |L z + r|^2 + c . z, up to constants."""
-
-    root: Floats  # L (N, z, z), or (1, z, z) for all
-    shift: Floats  # r (N, z)
-    linear: Floats  # c (N, z)
-
-    def after(self, D: Floats) -> Squares:
-        """The functions of x with z = D x."""
-        return Squares(self.root @ D, self.shift, self.linear @ D)
-
-    def padded(self, size: int) -> Squares:
-        """The same functions of ``size`` variables."""
-        more = size - self.shift.shape[1]
-        root = np.pad(self.root, ((0, 0), (0, more), (0, more)))
-        return Squares(root, *(np.pad(part, ((0, 0), (0, more))) for part in (self.shift, self.linear)))
-
-    @property
-    def core(self) -> core.Squares:
-        """The squares as an object of the compiled core."""
-        return core.Squares(self.root, self.shift, self.linear)
-
-
-def squares_of(gradient: Floats, hessian: Floats) -> Squares | None:
+def squares_of(gradient: Floats, hessian: Floats, slopes: Floats | None = None, more: int = 0) -> core.Squares | None:
     """Squares from ``gradient`` (N, z) and ``hessian`` (N, z, z) or (1, z, z); None if one is not semidefinite.
 
-    The linear part has only the gradient's component in the Hessian's null space: in squares a gradient keeps its
-    digits.
+    They are N functions (1/2) |L z + r|^2 + c . z, up to constants, of x with z = ``slopes`` x where these are given,
+    and of ``more`` variables on which they do not depend. The linear part has only the gradient's component in the
+    Hessian's null space: in squares a gradient keeps its digits.
     """
     size = np.sqrt(np.abs(np.diagonal(hessian, axis1=-2, axis2=-1)))
     unit = np.where(size > 0.0, size, 1.0)
@@ -188,4 +164,8 @@ def squares_of(gradient: Floats, hessian: Floats) -> Squares | None:
     along = (across @ (gradient / unit)[..., None])[..., 0]
     shift = np.where(known, along / np.where(known, weight, 1.0), 0.0)
     linear = unit * (vectors @ np.where(known, 0.0, along)[..., None])[..., 0]
-    return Squares(weight[..., :, None] * across * unit[..., None, :], shift, linear)
+    root = weight[..., :, None] * across * unit[..., None, :]
+    if slopes is not None:
+        root, linear = root @ slopes, linear @ slopes
+    wider = (0, 0), (0, more)
+    return core.Squares(np.pad(root, (*wider, (0, more))), np.pad(shift, wider), np.pad(linear, wider))

@@ -31,7 +31,7 @@ from varpin.control.riccati import Plan, backward, foreseen, noise_shares
 from varpin.control.second_order import curvature_along
 from varpin.control.sizes import FEASIBLE, HARMLESS, NOTABLE, ROUNDING, SLIGHT, TRACE
 from varpin.control.solution import Solution
-from varpin.control.stages import Layout, Rows, Stages, Steps, states
+from varpin.control.stages import Cost, Rows, Steps, change, states
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError, StepError
 from varpin.integrators import Integrator
@@ -104,7 +104,7 @@ class Search:
         self.noise: Plan | None = None  # the pass whose value function tells what noise costs
         self.step: Step | None = None
         self.exact = self.unsolved = False
-        self.stages: Stages | None = None
+        self.quadratic: list[Cost] = []
         self._passes = 0  # backward passes since the last entry of the history
         robot = problem.scene.robot.name
         self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {problem.t0:g} s"
@@ -283,9 +283,9 @@ class Search:
         plain = self.regularization == 0.0 and not self._has_goals
         free = not self.bound and (not problem.limited or self._is_free(plan, ()))
         if not free:
-            self.stages = Stages.along(along, self.noise.spread if problem.scene.processes else None, curvature)
+            self.quadratic = along.quadratic(self.noise.spread if problem.scene.processes else None, curvature)
             given = zip(self.bound, self.tightening.margins, strict=True)
-            self.rows = [self.stages.rows(*pair) for pair in given]
+            self.rows = [along.rows(*pair) for pair in given]
             self._excess = [_excess(row.values, equality=row.equality) for row in self.rows]
             free = bool(self.bound) and plain and self._is_free(plan, self.rows)
         if not free:
@@ -315,13 +315,12 @@ class Search:
 
     def _solve(self, plan: Plan) -> bool:
         """Make the step by a quadratic program within limits and rows; whether it has a solution."""
-        problem, stages, rows = self.problem, self.stages, self.rows
-        assert stages is not None
+        problem, along, rows = self.problem, self.along, self.rows
         u, (lower, upper) = problem.decided(self.trajectory), problem.control_limits
         least, most = np.minimum(lower - u, 0.0), np.maximum(upper - u, 0.0)
         if problem.begin is not None:
             least[0], most[0] = (np.where(np.isnan(problem.begin), part[0], 0.0) for part in (least, most))
-        program = Program(stages, rows, (least, most), plan, self.regularization if rows else 0.0)
+        program = Program(along, rows, (least, most), plan, self.regularization if rows else 0.0)
         self.program = program
         values, bad = [row.values for row in rows], self._badness
         found = program.minimum(values)
@@ -344,9 +343,9 @@ class Search:
             (np.where(np.abs(part) > TRACE * largest, part, 0.0) / item.scale).reshape(item.shape)
             for part, item in zip(found.multipliers, self.bound, strict=True)
         ]
-        linear, whole = stages.change(found.z)
+        linear, whole = change(self.quadratic, found.z)
         removed = self.weight * (bad - found.slack)
-        gradient = stages.slopes(rows, found.multipliers)
+        gradient = along.layout.controls_of(along.lagrangian(self.quadratic, rows, found.multipliers))
         self.step = Step(self._feedforward(found.z), gradient, linear - removed, removed - whole, found, elastic)
         return True
 
@@ -373,20 +372,20 @@ class Search:
 
     def _feedforward(self, z: Floats) -> Floats:
         """The changes of the controls in z, without what feedback gives for its states."""
-        plan, stages = self.plan, self.stages
+        plan = self.plan
         assert plan is not None
-        assert stages is not None
-        at, beside = stages.layout.decisions(plan.feedback, plan.previous)
+        at, beside = self.along.layout.decisions(plan.feedback, plan.previous)
         return (beside @ np.where(at >= 0, z[at], 0.0)[:, :, None])[:, :, 0]
 
     def _costates(self) -> Floats:
         """Derivatives (N, 2n) of the Lagrangian in the state after each step, with the known multipliers."""
-        stages, rows, pushes = Stages.along(self.along), [], []
+        along, rows, pushes = self.along, [], []
         for item, margin, push in zip(self.bound, self.tightening.margins, self.multipliers, strict=True):
             if push.any() and not item.of_controls:
-                rows.append(stages.rows(item, margin))
+                rows.append(along.rows(item, margin))
                 pushes.append(push.ravel() * item.scale)
-        return stages.costates(rows, pushes)
+        after = along.layout.state(np.arange(1, self.problem.steps + 1))
+        return along.lagrangian(along.quadratic(), rows, pushes)[after]
 
     def _ended(self, tolerance: float) -> Status | None:
         """The status of a search whose step gains no more than the tolerance; None if it goes on."""
@@ -528,7 +527,7 @@ class Search:
         now = problem.decided(self.trajectory)
         u, gains, previous = now + length * feedforward, plan.feedback, plan.previous
         if z is not None and problem.limited:
-            aim = now + length * Layout.of(problem).controls_of(z)
+            aim = now + length * self.along.layout.controls_of(z)
             for limit, sign in zip(problem.control_limits, (-1.0, 1.0), strict=True):
                 there = np.isfinite(limit) & (sign * (aim - limit) >= -TRACE * np.abs(limit))
                 u, gains = np.where(there, limit, u), np.where(there[:, :, None], 0.0, gains)
@@ -560,13 +559,13 @@ class Search:
 
     def _corrected(self, motion: Trajectory) -> Floats | None:
         """The changes with rows and dynamics as a full step found them; None where there are none."""
-        problem, step, stages = self.problem, self._known, self.stages
-        if step.minimum is None or stages is None or not self.bound:
+        problem, step, along = self.problem, self._known, self.along
+        if step.minimum is None or not self.bound:
             return None
         moved = states(problem, motion) - states(problem, self.trajectory)
-        z = stages.layout.joined(moved, problem.decided(motion) - problem.decided(self.trajectory))
+        z = along.layout.joined(moved, problem.decided(motion) - problem.decided(self.trajectory))
         values = [there - change for there, change in zip(self._values(motion), changes(self.rows, z), strict=True)]
-        found = self.program.minimum(values, stages.gaps_of(z), self.weight if step.elastic else None)
+        found = self.program.minimum(values, along.gaps_of(z), self.weight if step.elastic else None)
         return None if found is None else found.z
 
     def _share(self, tolerance: float) -> float:
