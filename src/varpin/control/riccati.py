@@ -15,7 +15,7 @@ from varpin import core
 from varpin.arrays import Floats, Mask
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.sizes import HARMLESS, ROUNDING
-from varpin.control.stages import Recursion, Steps
+from varpin.control.stages import Recursion, Steps, states_of
 from varpin.integrators.base import noise_fields
 from varpin.linearization import velocity_at_nodes, velocity_curvature
 from varpin.trajectory import Trajectory
@@ -34,6 +34,15 @@ class Plan(NamedTuple):
     spread: Floats  # (N, 2n, 2n), likewise: Hessians in the noise's effect on the state after each step
     loss: float  # estimated relative rounding error of Quu, or of its root
     factors: Floats  # (R, m, m) L D L' of the regularized Quu
+
+    @classmethod
+    def none(cls, problem: OptimalControlProblem) -> Plan:
+        """What is known before the first pass: no feedback and no change of the controls."""
+        R, m, x = problem.decisions, problem.scene.controls, 2 * problem.scene.robot.dof
+        gains, still, noise = np.zeros((R, m, states_of(problem))), np.zeros((R, m)), problem.scene.processes
+        jumps, spread, factors = np.empty((0, x, x // 2)), np.empty((0, x, x)), np.zeros((R, m, m))
+        cost = np.nan if noise else 0.0
+        return cls(still, gains, x, np.full((R, m), np.nan), 0.0, cost, jumps, spread, 0.0, factors)
 
     @property
     def feedback(self) -> Floats:

@@ -61,6 +61,10 @@ _ABOVE, _HEAVY = 1.5, 10.0
 _HALVINGS = 5
 
 
+# What a search keeps in its :class:`SearchState`, and what its margins do.
+_KEPT, _OF_MARGINS = ("weight", "regularization", "growth", "first", "second_order"), ("counts", "since", "rounds")
+
+
 class Step(NamedTuple):
     """What a quadratic program or a backward pass gives."""
 
@@ -70,6 +74,11 @@ class Step(NamedTuple):
     decrease: float  # of the merit by a full step, foreseen
     minimum: Minimum | None = None  # of the program; None without limits and rows in reach
     elastic: bool = False  # whether rows may be missed
+
+    @classmethod
+    def of(cls, plan: Plan) -> Step:
+        """That of a backward pass."""
+        return cls(plan.feedforward, plan.gradient, plan.slope, plan.expected_decrease)
 
 
 class Search:
@@ -98,11 +107,11 @@ class Search:
         self.tightening = Tightening(problem)
         self.history: list[Iteration] = []
         self.cost = np.inf
-        self.reason, self.deadline = "", np.inf
+        self.reason = ""
         self.state: SearchState | None = None
-        self.plan: Plan | None = None
-        self.noise: Plan | None = None  # the pass whose value function tells what noise costs
-        self.step: Step | None = None
+        self.plan = Plan.none(problem)
+        self.noise = self.plan  # the pass whose value function tells what noise costs
+        self.step = Step.of(self.plan)
         self.exact = self.unsolved = False
         self.quadratic: list[Cost] = []
         self._passes = 0  # backward passes since the last entry of the history
@@ -132,10 +141,11 @@ class Search:
         state, known = plan.search, plan.multipliers
         assert state is not None
         self._move(plan.trajectory, self.problem.shares(plan.trajectory))
-        self.weight, self.first, margins = state.weight, state.first, self.tightening
-        margins.counts, margins.since, margins.rounds = state.counts, state.since, state.rounds
-        self.regularization, self.growth = state.regularization, state.growth
-        self.second_order = self.second_order or state.second_order
+        second_order = self.second_order or state.second_order
+        for owner, names in ((self, _KEPT), (self.tightening, _OF_MARGINS)):
+            for name in names:
+                setattr(owner, name, getattr(state, name))
+        self.second_order = second_order
         self.history = list(plan.history[: state.iterations])
         if known is not None:
             self.take(known)
@@ -149,7 +159,7 @@ class Search:
 
     def run(self, tolerance: float, max_iterations: int, deadline: float, report: Report) -> Status:
         """Iterate to the end."""
-        last, longest, self.deadline = len(self.history) + max_iterations, 0.0, deadline
+        last, longest = len(self.history) + max_iterations, 0.0
         while True:
             self.state = self._state()
             started = time.perf_counter()
@@ -167,7 +177,7 @@ class Search:
                 logger.warning("%s: %s", self.label, error)
                 self.reason = str(error)
                 return Status.NOT_DIFFERENTIABLE
-            close = ended is None and self._known.decrease <= SLIGHT * stake.moved
+            close = ended is None and self.step.decrease <= SLIGHT * stake.moved
             if (close or ended in (Status.CONVERGED, Status.INFEASIBLE)) and self._goes_on(ended):
                 continue
             ended = ended or self._out_of(last, deadline)
@@ -176,7 +186,7 @@ class Search:
                 self._note(report, started)
                 self.reason = self.reason or self._numbers(tolerance)
                 return ended
-            step = self._known
+            step = self.step
             taken = self._line_search()
             self._note(report, started, taken)
             longest = max(longest, time.perf_counter() - started)
@@ -225,11 +235,6 @@ class Search:
         """Sum of all violations, in tenths of ranges."""
         return float(sum(part.sum() for part in self._excess))
 
-    @property
-    def _known(self) -> Step:
-        assert self.step is not None
-        return self.step
-
     def _move(self, motion: Trajectory, shares: Floats) -> None:
         self.trajectory, self.shares, self.cost = motion, shares, float(shares.sum())
         self.along = Steps(self.problem, motion)
@@ -242,17 +247,9 @@ class Search:
         self._excess: list[Floats] = [np.zeros(item.size) for item in self.bound]  # in tenths of ranges
 
     def _state(self) -> SearchState:
-        return SearchState(
-            weight=self.weight,
-            regularization=self.regularization,
-            growth=self.growth,
-            first=self.first,
-            counts=self.tightening.counts,
-            since=self.tightening.since,
-            rounds=self.tightening.rounds,
-            second_order=self.second_order,
-            iterations=len(self.history),
-        )
+        own: dict[str, Any] = {name: getattr(self, name) for name in _KEPT}
+        margins = {name: getattr(self.tightening, name) for name in _OF_MARGINS}
+        return SearchState(**own, **margins, iterations=len(self.history))
 
     def _made(self) -> bool:
         """Make feedback, rows and the step of the motion with the present regularization; whether there is one."""
@@ -277,8 +274,7 @@ class Search:
             self.noise = self._pass(0.0) or plan
         if self._has_goals:
             self.plan = self._pass_to_goals() or plan
-        elastic = self.step is not None and self.step.elastic
-        self.tightening.follow(along, self.plan, len(self.history), grow=not elastic)
+        self.tightening.follow(along, self.plan, len(self.history), grow=not self.step.elastic)
         # The step is the pass's own, where that keeps to all limits and rows.
         plain = self.regularization == 0.0 and not self._has_goals
         free = not self.bound and (not problem.limited or self._is_free(plan, ()))
@@ -290,7 +286,7 @@ class Search:
             free = bool(self.bound) and plain and self._is_free(plan, self.rows)
         if not free:
             return self._solve(plan)
-        self.step = Step(plan.feedforward, plan.gradient, plan.slope, plan.expected_decrease)
+        self.step = Step.of(plan)
         self.multipliers = [np.zeros(item.shape) for item in self.bound]
         return True
 
@@ -373,7 +369,6 @@ class Search:
     def _feedforward(self, z: Floats) -> Floats:
         """The changes of the controls in z, without what feedback gives for its states."""
         plan = self.plan
-        assert plan is not None
         at, beside = self.along.layout.decisions(plan.feedback, plan.previous)
         return (beside @ np.where(at >= 0, z[at], 0.0)[:, :, None])[:, :, 0]
 
@@ -407,7 +402,7 @@ class Search:
         return found
 
     def _verdict(self, tolerance: float) -> Status | None:
-        step, share, bad = self._known, self._share(tolerance), self._badness
+        step, share, bad = self.step, self._share(tolerance), self._badness
         if self.violation > FEASIBLE:
             # By the program, or by what the search has done.
             dear, merits = self.weight * bad, self._merits()
@@ -433,7 +428,6 @@ class Search:
         past = self.history[self.tightening.since :]
         costs = [item.cost for item in past[:-1]]
         then = [(item.noise_cost, item.violation) for item in past[1:]]
-        assert self.noise is not None
         here = self.cost + self.noise.noise + self.weight * self._badness
         return [cost + noise + self.weight * bad for cost, (noise, bad) in zip(costs, then, strict=True)] + [here]
 
@@ -457,7 +451,6 @@ class Search:
         if self.tick:
             return False
         plan, margins, iteration = self.plan, self.tightening, len(self.history)
-        assert plan is not None
         # What cannot be met is violent, and does not widen margins.
         grow = ended is not Status.INFEASIBLE
         if ended is not None and margins.settle(self.along, plan, iteration, grow=grow):
@@ -478,8 +471,7 @@ class Search:
 
     def _line_search(self) -> Taken:
         """Move to the trial along the step whose merit, (O11), a line search accepts, if any."""
-        step, noise, problem, motion = self._known, self.noise, self.problem, self.trajectory
-        assert noise is not None
+        step, noise, problem, motion = self.step, self.noise, self.problem, self.trajectory
         z = None if step.minimum is None else step.minimum.z
         shares, bad = noise_shares(problem, motion, noise), self._badness
         integrator = self._in_bounds(motion)
@@ -523,7 +515,6 @@ class Search:
     def _along_step(self, length: float, feedforward: Floats, z: Floats | None) -> Commands:
         """Commands of a length along a step with changes z, whose controls that it brings to a limit stay there."""
         problem, plan = self.problem, self.plan
-        assert plan is not None
         now = problem.decided(self.trajectory)
         u, gains, previous = now + length * feedforward, plan.feedback, plan.previous
         if z is not None and problem.limited:
@@ -559,7 +550,7 @@ class Search:
 
     def _corrected(self, motion: Trajectory) -> Floats | None:
         """The changes with rows and dynamics as a full step found them; None where there are none."""
-        problem, step, along = self.problem, self._known, self.along
+        problem, step, along = self.problem, self.step, self.along
         if step.minimum is None or not self.bound:
             return None
         moved = states(problem, motion) - states(problem, self.trajectory)
@@ -573,7 +564,7 @@ class Search:
         return tolerance * (self.along.stake.moved + HARMLESS * self.first)
 
     def _expected(self) -> str:
-        return f"the expected decrease is {self._known.decrease:.1e}"
+        return f"the expected decrease is {self.step.decrease:.1e}"
 
     def _numbers(self, tolerance: float) -> str:
         share = self._share(tolerance)
@@ -596,17 +587,16 @@ class Search:
         return Status.INFEASIBLE
 
     def _note(self, report: Report, started: float, taken: Taken | None = None) -> None:
-        step, noise = self._known, self.noise
         item = Iteration(
             index=len(self.history),
             cost=self.cost,
-            noise_cost=0.0 if noise is None else noise.noise,
+            noise_cost=self.noise.noise,
             violation=self._badness,
-            expected_decrease=step.decrease,
+            expected_decrease=self.step.decrease,
             decrease=0.0 if taken is None or taken.length == 0.0 else -taken.best.merit,
             step=0.0 if taken is None else taken.length,
             regularization=self.regularization,
-            gradient=float(np.abs(step.gradient).max()),
+            gradient=float(np.abs(self.step.gradient).max()),
             backward_passes=self._passes,
             rollouts=0 if taken is None else taken.trials,
             seconds=time.perf_counter() - started,
@@ -639,11 +629,7 @@ class Search:
 
     def solution(self, status: Status) -> Solution:
         """The motion, however the search ended, with the feedback around it."""
-        problem, plan, step = self.problem, self.plan, self.step
-        R, m, n = problem.decisions, problem.scene.controls, problem.scene.robot.dof
-        previous = None
-        if problem.rate is not None or problem.linear:
-            previous = np.zeros((R, m, m)) if plan is None or plan.previous is None else plan.previous
+        problem, plan = self.problem, self.plan
         known = None
         if problem.constraints:
             known = Multipliers(
@@ -653,20 +639,19 @@ class Search:
                 added=None if self.tightening.added is None else flat(self.tightening.added),
             )
         reason = self.reason
-        if plan is not None and plan.loss > HARMLESS:
+        if plan.loss > HARMLESS:
             lost = f"rounding may have changed Quu by {plan.loss:.0e} of itself: weights or inertias are too far apart"
             logger.warning("%s: the gains cannot be trusted: %s", self.label, lost)
             reason = f"{reason}; {lost}"
-        known_noise = np.nan if problem.scene.processes else 0.0
         return Solution(
             problem=problem,
             trajectory=self.trajectory,
-            gains=np.zeros((R, m, 2 * n)) if plan is None else plan.feedback,
-            previous_gains=previous,
-            feedforward=np.zeros((R, m)) if step is None else step.feedforward,
-            gradient=np.full((R, m), np.nan) if step is None else step.gradient,
+            gains=plan.feedback,
+            previous_gains=plan.previous,
+            feedforward=self.step.feedforward,
+            gradient=self.step.gradient,
             cost=self.cost,
-            noise_cost=known_noise if self.noise is None else self.noise.noise,
+            noise_cost=self.noise.noise,
             status=status,
             reason=reason,
             history=tuple(self.history),

@@ -74,6 +74,12 @@ class Terminal(NamedTuple):
     slopes: Floats
 
 
+def states_of(problem: OptimalControlProblem) -> int:
+    """The number of states X of :class:`Recursion`."""
+    m, x = problem.scene.controls, 2 * problem.scene.robot.dof
+    return x + m + m % 2 if problem.linear or problem.rate is not None else x
+
+
 class Recursion(NamedTuple):
     """Steps as the backward recursion takes them, in z = (X, u).
 
@@ -325,15 +331,9 @@ class Steps:
             found[1::2, own] = 2.0 * np.eye(m, Z, Z - m) - np.eye(m, Z, x)
         return found
 
-    @property
-    def states(self) -> int:
-        """The number of states X of :class:`Recursion`."""
-        m, x = self.problem.scene.controls, 2 * self.problem.scene.robot.dof
-        return x + m + m % 2 if self.problem.linear or self.problem.rate is not None else x
-
     @cached_property
     def _wide(self) -> Recursion:
-        problem, (N, x, _), X = self.problem, self.J.shape, self.states
+        problem, (N, x, _), X = self.problem, self.J.shape, states_of(self.problem)
         gradient, hessian = (part / problem.dt for part in self.costs)
         if self.lin.G.shape[2]:
             slope, bend = self.of_noise(self.kicked / problem.dt)
@@ -366,7 +366,7 @@ class Steps:
     def _places(self) -> Integers:
         """Where the variables of steps are in z of :class:`Recursion`."""
         m, Z = self.problem.scene.controls, self.J.shape[2]
-        return np.concatenate([np.arange(Z - m), self.states + np.arange(m)])
+        return np.concatenate([np.arange(Z - m), states_of(self.problem) + np.arange(m)])
 
     def recursion(self, curvature: Floats | None, fixed: Mask | None) -> Recursion:
         """The steps for the recursion, with second derivatives (N, Z, Z), and controls (R, m) that stay ``fixed``."""
