@@ -375,8 +375,7 @@ def regions(figure: Figure, constraints: Sequence[PlanConstraint], times: Floats
         yield _solid("obstacle", body.name, points @ body.rotation.T, body.radius, body.begin + shifts)
     for c in constraints:
         if isinstance(c, kinds.KeepInSphere | kinds.KeepOutOfSphere):
-            centers = c.shifts(times) if callable(c.center) else c.shifts(times)[:1]
-            yield _solid("out" if c.outside else "in", c.frame, np.zeros((1, 3)), c.radius, centers)
+            yield _solid("out" if c.outside else "in", c.frame, np.zeros((1, 3)), c.radius, c.centers(times))
         elif isinstance(c, kinds.KeepInBox):
             yield _open_box(figure, c.frame, c.limits, np.zeros(3), np.eye(3))
         elif isinstance(c, kinds.KeepInHalfSpace):
