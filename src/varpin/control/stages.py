@@ -388,7 +388,7 @@ class Steps:
             could, does = _stakes(expansion, change)
             free, moved = free + factor * could, moved + factor * does
         if self.problem.rate is not None:
-            rate = float(self.problem.rate.value(self.problem.decided(self.trajectory), self.problem.period))
+            rate = float(self.problem.rate.shares(self.problem.decided(self.trajectory), self.problem.period).sum())
             free, moved = free + rate, moved + rate
         return Stake(free, moved)
 

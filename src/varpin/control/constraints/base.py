@@ -136,10 +136,7 @@ class PlanConstraint(Frozen, ABC):
         return type(self).__name__
 
     def __repr__(self) -> str:
-        """All parameters to the last digit, for comparison with other constraints."""
-        values = {name: value for name, value in vars(self).items() if not isinstance(value, Robot) and name[0] != "_"}
-        arguments = (f"{name}={_argument(value)}" for name, value in values.items() if name != "kinematics")
-        return f"{type(self).__name__}({', '.join(arguments)})"
+        return self.label
 
 
 class OfStates(PlanConstraint):
@@ -194,10 +191,6 @@ class BoundStates(BoundConstraint):
 
     def jacobian(self, q: Floats, v: Floats) -> Floats:
         return self.of.jacobian(q[self.places], v[self.places])
-
-
-def _argument(value: object) -> str:
-    return repr(value.tolist() if isinstance(value, np.ndarray) else value)
 
 
 def checked_margin(constraint: PlanConstraint, margin: object) -> float:

@@ -79,11 +79,6 @@ class ControlRate(Frozen):
         shares: Floats = ((changes @ (self.weight / period)) * changes).sum(axis=-1)
         return shares
 
-    def value(self, u: Floats, period: float) -> Floats:
-        """The cost (...) of controls (..., N, m) that change every ``period`` [s]."""
-        total: Floats = self.shares(u, period).sum(axis=-1)
-        return total
-
     def expand(self, u: Floats, period: float) -> tuple[Floats, Floats]:
         """Gradients (N, m) and Hessians (N, m, m) in u_k of the cost of each change, at controls (N, m)."""
         hessian = np.tile(2.0 * self.weight / period, (len(u), 1, 1))
