@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -114,6 +114,7 @@ class Search:
         self.step = Step.of(self.plan)
         self.exact = self.unsolved = False
         self.quadratic: list[Cost] = []
+        self._values: list[Floats] = []  # of all rows, margins included, in tenths of ranges
         self._passes = 0  # backward passes since the last entry of the history
         robot = problem.scene.robot.name
         self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {problem.t0:g} s"
@@ -280,9 +281,9 @@ class Search:
         free = not self.bound and (not problem.limited or self._is_free(plan, ()))
         if not free:
             self.quadratic = along.quadratic(self.noise.spread if problem.scene.processes else None, curvature)
-            given = zip(self.bound, self.tightening.margins, strict=True)
-            self.rows = [along.rows(*pair) for pair in given]
-            self._excess = [_excess(row.values, equality=row.equality) for row in self.rows]
+            self.rows = [along.rows(item) for item in self.bound]
+            self._values = self._values_of(self.trajectory)
+            self._excess = self._excess_of(self._values)
             free = bool(self.bound) and plain and self._is_free(plan, self.rows)
         if not free:
             return self._solve(plan)
@@ -297,17 +298,10 @@ class Search:
         exists = smooth and self.problem.integrator.variational and not self.tick
         return exists and saturates(scene, self.trajectory)
 
-    def _pass(
-        self,
-        regularization: float,
-        curvature: Floats | None = None,
-        *,
-        steps: Steps | None = None,
-        fixed: Mask | None = None,
-    ) -> Plan | None:
+    def _pass(self, regularization: float, curvature: Floats | None = None, fixed: Mask | None = None) -> Plan | None:
         """A backward pass of the costs, in which some controls (R, m) may stay as they are."""
         self._passes += 1
-        return backward(steps or self.along, regularization, curvature=curvature, fixed=fixed)
+        return backward(self.along, regularization, curvature=curvature, fixed=fixed)
 
     def _solve(self, plan: Plan) -> bool:
         """Make the step by a quadratic program within limits and rows; whether it has a solution."""
@@ -318,7 +312,7 @@ class Search:
             least[0], most[0] = (np.where(np.isnan(problem.begin), part[0], 0.0) for part in (least, most))
         program = Program(along, rows, (least, most), plan, self.regularization if rows else 0.0)
         self.program = program
-        values, bad = [row.values for row in rows], self._badness
+        values, bad = self._values, self._badness
         found = program.minimum(values)
         needed = np.inf if found is None else _ABOVE * _largest(found.multipliers)
         # Rows that cost far more than what is at stake are approached step by step.
@@ -358,13 +352,14 @@ class Search:
                 J = item.jacobian(self.trajectory.q, self.trajectory.v)[-1] @ end.slopes / item.scale
                 hessian += max(abs(self.cost), self.first) * J.T @ J
         vars(made)["terminal"] = end._replace(hessian=hessian)
-        return self._pass(0.0, steps=made)
+        self._passes += 1
+        return backward(made, 0.0)
 
     def _is_free(self, plan: Plan, rows: Sequence[Rows]) -> bool:
         """Whether the full step of a backward pass keeps to all limits and rows, by the linear model."""
         z, limited = foreseen(self.along, plan)
-        met = ((row.values + change <= 0.0).all() for row, change in zip(rows, changes(rows, z), strict=True))
-        return not limited and all(met)
+        moves = zip(self._values, changes(rows, z), strict=True)
+        return not limited and all((c + move <= 0.0).all() for c, move in moves)
 
     def _feedforward(self, z: Floats) -> Floats:
         """The changes of the controls in z, without what feedback gives for its states."""
@@ -375,9 +370,9 @@ class Search:
     def _costates(self) -> Floats:
         """Derivatives (N, 2n) of the Lagrangian in the state after each step, with the known multipliers."""
         along, rows, pushes = self.along, [], []
-        for item, margin, push in zip(self.bound, self.tightening.margins, self.multipliers, strict=True):
+        for item, push in zip(self.bound, self.multipliers, strict=True):
             if push.any() and not item.of_controls:
-                rows.append(along.rows(item, margin))
+                rows.append(along.rows(item))
                 pushes.append(push.ravel() * item.scale)
         after = along.layout.state(np.arange(1, self.problem.steps + 1))
         return along.lagrangian(along.quadratic(), rows, pushes)[after]
@@ -487,7 +482,8 @@ class Search:
                 if problem.scene.processes:
                     merit += float((noise_shares(problem, moved, noise) - shares).sum())
                 if self.bound:
-                    merit += self.weight * (sum(float(part.sum()) for part in self._violations(moved)) - bad)
+                    excess = self._excess_of(self._values_of(moved))
+                    merit += self.weight * (sum(float(part.sum()) for part in excess) - bad)
             except TRIAL_ERRORS as error:
                 logger.info("%s: trial: %s", self.label, error)
                 return Trial()
@@ -505,12 +501,11 @@ class Search:
     def _in_bounds(self, motion: Trajectory) -> Integrator:
         """The integrator of trials, whose steps may not be halved much more often than those of a motion."""
         integrator: Any = self.problem.integrator
-        if getattr(integrator, "guard", None) is None:
-            return self.problem.integrator
-        halvings = int(motion.statistics.halvings.max(initial=0)) + _HALVINGS
-        guard = replace(integrator.guard, max_halvings=min(integrator.guard.max_halvings, halvings))
-        bounded: Integrator = replace(integrator, guard=guard)
-        return bounded
+        if getattr(integrator, "guard", None) is not None:
+            halvings = int(motion.statistics.halvings.max(initial=0)) + _HALVINGS
+            guard = replace(integrator.guard, max_halvings=min(integrator.guard.max_halvings, halvings))
+            integrator = replace(integrator, guard=guard)
+        return cast(Integrator, integrator)
 
     def _along_step(self, length: float, feedforward: Floats, z: Floats | None) -> Commands:
         """Commands of a length along a step with changes z, whose controls that it brings to a limit stay there."""
@@ -536,12 +531,13 @@ class Search:
         times = np.array(problem.integrator.stage_times or (0.5,))
         return commands._replace(u=u[1:], gains=gains[1:], before=first, stage_times=times)
 
-    def _violations(self, motion: Trajectory) -> list[Floats]:
-        """Violations (P,) of all rows on a motion, margins included, in tenths of ranges."""
-        values = zip(self._values(motion), self.bound, strict=True)
-        return [_excess(part, equality=item.source.equality) for part, item in values]
+    def _excess_of(self, values: Sequence[Floats]) -> list[Floats]:
+        """Violations (P,) by values of all rows."""
+        pairs = zip(values, self.bound, strict=True)
+        return [np.abs(c) if item.source.equality else np.maximum(c, 0.0) for c, item in pairs]
 
-    def _values(self, motion: Trajectory) -> list[Floats]:
+    def _values_of(self, motion: Trajectory) -> list[Floats]:
+        """Values (P,) of all rows on a motion, margins included, in tenths of ranges."""
         u = self.problem.control_rows(motion)
         return [
             (item.value(motion.q, motion.v, u) + margin).ravel() / item.scale
@@ -555,7 +551,7 @@ class Search:
             return None
         moved = states(problem, motion) - states(problem, self.trajectory)
         z = along.layout.joined(moved, problem.decided(motion) - problem.decided(self.trajectory))
-        values = [there - change for there, change in zip(self._values(motion), changes(self.rows, z), strict=True)]
+        values = [there - change for there, change in zip(self._values_of(motion), changes(self.rows, z), strict=True)]
         found = self.program.minimum(values, along.gaps_of(z), self.weight if step.elastic else None)
         return None if found is None else found.z
 
@@ -662,7 +658,3 @@ class Search:
 
 def _largest(multipliers: Sequence[Floats]) -> float:
     return max((float(np.abs(part).max(initial=0.0)) for part in multipliers), default=0.0)
-
-
-def _excess(values: Floats, *, equality: bool) -> Floats:
-    return np.abs(values) if equality else np.maximum(values, 0.0)

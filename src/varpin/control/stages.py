@@ -172,7 +172,6 @@ class Cost(NamedTuple):
 class Rows(NamedTuple):
     """The rows of one constraint, in tenths of its range."""
 
-    values: Floats  # (P,) c with its margin
     at: Integers  # (P, Z) indices of variables, -1 where there is none
     slopes: Floats  # (P, Z)
     equality: bool
@@ -432,12 +431,10 @@ class Steps:
             costs.append(Cost(at, np.concatenate([-pull, pull], axis=1), np.block([[rate, -rate], [-rate, rate]])))
         return costs
 
-    def rows(self, bound: BoundConstraint, margin: Floats) -> Rows:
-        """The rows of a constraint along the motion, with a margin (K, rows)."""
-        motion, u = self.trajectory, self.problem.control_rows(self.trajectory)
-        values = (bound.value(motion.q, motion.v, u) + margin).ravel() / bound.scale
+    def rows(self, bound: BoundConstraint) -> Rows:
+        """The rows of a constraint along the motion."""
         at, slopes = self._in_decisions(bound)
-        return Rows(values, at, slopes / bound.scale, bound.source.equality)
+        return Rows(at, slopes / bound.scale, bound.source.equality)
 
     def _in_decisions(self, bound: BoundConstraint) -> tuple[Integers, Floats]:
         """Indices (P, Z) of the variables of a constraint's rows, and derivatives."""
