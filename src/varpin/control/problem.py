@@ -22,7 +22,6 @@ from varpin.control.costs import (
     ControlRateCost,
     Cost,
     CostSum,
-    Expansion,
     Points,
     control_rate,
     with_control_before,
@@ -580,14 +579,6 @@ class OptimalControlProblem(Frozen):
             increments=0.0 if rng is None and increments is None else increments,
             check=False,
         )
-
-    def expand_running(self, trajectory: Trajectory) -> Expansion:
-        """Expansion of the running costs along a motion, at their samples, in (q, v, u)."""
-        return self.running.expand(*self.samples(trajectory.q, trajectory.v, self.control_rows(trajectory)))
-
-    def expand_terminal(self, trajectory: Trajectory) -> Expansion:
-        """Expansion of the terminal costs at the end of a motion, in (q, v, u)."""
-        return self.terminal.expand(*self._end(trajectory.q, trajectory.v))
 
 
 def require_problem(problem: object) -> OptimalControlProblem:

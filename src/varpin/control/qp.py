@@ -6,6 +6,7 @@ R. Schwan, Y. Jiang, D. Kuhn and C. N. Jones, "PIQP: a proximal interior-point q
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -133,36 +134,28 @@ class Program:
         upper = np.append(self._upper, np.full(slack, np.inf))[order]
         P = _matrix([(rank[i], j, part) for i, j, part in squares], size, rank)
         A, G = (_matrix(own, count, rank) if own else None for own, count in zip(parts, first, strict=True))
-        return _Form(P, c, A, G, lower, upper, rank[:-1])
+        return _Form((P, c, A, G, lower, upper), rank[:-1])
 
 
+@dataclass
 class _Form:
     """A program whose right sides may change."""
 
-    def __init__(
-        self,
-        P: sp.csc_matrix,
-        c: Floats,
-        A: sp.csc_matrix | None,
-        G: sp.csc_matrix | None,
-        lower: Floats,
-        upper: Floats,
-        rank: Integers,
-    ) -> None:
-        self._given, self.rank = (P, c, A, G, lower, upper), rank
-        self._solvers: dict[Any, Any] = {}
+    given: tuple[Any, ...]  # P, c, A, G, and least and greatest z
+    rank: Integers  # of the variables in the solver's order
+    solvers: dict[Any, Any] = field(default_factory=dict)
 
     def solve(self, b: Floats, h: Floats) -> Any:
         """PIQP's result; None where there is no minimum or the solver fails."""
-        P, c, A, G, lower, upper = self._given
+        P, c, A, G, lower, upper = self.given
         most = None if G is None else h
         # Stage by stage is faster, the factors of the whole matrix are more accurate.
         for kind in (piqp.KKTSolver.sparse_multistage, piqp.KKTSolver.sparse_ldlt):
-            if kind in self._solvers:
-                solver = self._solvers[kind]
+            if kind in self.solvers:
+                solver = self.solvers[kind]
                 solver.update(b=b, h_u=most)
             else:
-                solver = self._solvers[kind] = piqp.SparseSolver()
+                solver = self.solvers[kind] = piqp.SparseSolver()
                 settings = solver.settings
                 settings.kkt_solver = kind
                 settings.eps_abs, settings.eps_rel, settings.max_iter = _RESIDUAL, _RESIDUAL, _STEPS

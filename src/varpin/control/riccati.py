@@ -88,7 +88,7 @@ def _pass(steps: Steps, given: Recursion, regularization: float, *, second: bool
         hessian[:x, :x] += velocity_curvature(problem.scene, motion.q[-1:], motion.v[-1:], pull)[0]
     feedforward, gains, by_controls = np.empty((R, m)), np.empty((R, m, X)), np.empty((R, m))
     spread, factors = np.empty((S if k else 0, X, X)), np.empty((R, m, m))
-    given_arrays = {
+    arrays: dict[str, Any] = {
         "A": given.J[:, :, :X],
         "B": given.J[:, :, X:],
         "G": given.G,
@@ -96,9 +96,12 @@ def _pass(steps: Steps, given: Recursion, regularization: float, *, second: bool
         "Gu": given.Gz[..., X:],
         "gradient": given.gradient,
         "hessian": given.hessian,
+        "feedforward": feedforward,
+        "feedback": gains,
+        "control_gradient": by_controls,
+        "spread": spread,
+        "factors": factors,
     }
-    found_arrays = {"feedforward": feedforward, "feedback": gains, "control_gradient": by_controls}
-    arrays: dict[str, Any] = {**given_arrays, **found_arrays, "spread": spread, "factors": factors}
     found: core.BackwardPass | core.RootPass
     if roots:
         final = squares_of(end.cost.gradient, end.cost.hessian, end.slopes, X - x)
@@ -128,7 +131,9 @@ def foreseen(steps: Steps, plan: Plan) -> tuple[Floats, bool]:
     problem, given = steps.problem, steps.recursion(None, None)
     (S, X, _), layout = given.J.shape, steps.layout
     R, m = plan.feedforward.shape
-    slack = steps.slack if problem.limited else np.zeros((0, 2, m))
+    slack = np.zeros((0, 2, m))
+    if problem.limited:
+        slack = problem.control_limits - problem.decided(steps.trajectory)[:, None]
     moves, after = np.empty((R, m)), np.empty((S, X))
     limited = core.foresee(
         problem.hold, given.J[:, :, :X], given.J[:, :, X:], plan.feedforward, plan.gains, slack, moves, after

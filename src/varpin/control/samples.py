@@ -18,28 +18,23 @@ from varpin.trajectory import Trajectory
 _TERMS, _SHORT = 11, 0.125
 
 
-def at_samples(rule: Floats, J: Floats, velocity: Floats | None) -> Floats:
+def at_samples(rule: Floats, J: Floats, velocity: Floats) -> Floats:
     """Derivatives (N, s, 2n, Z) of (q, v) at each sample of N steps, from those J (N, 2n, Z) of the state after them.
 
-    The variables begin with the state before the step. ``velocity`` is dv/dx (N + 1, n, 2n) at nodes, None where x
-    holds v.
+    The variables begin with the state before the step. ``velocity`` is dv/dx (N + 1, n, 2n) at nodes.
     """
     N, x, Z = J.shape
     n = x // 2
     nodes = np.zeros((N, 4, n, Z))
     nodes[:, 0, :, :n] = np.eye(n)
-    if velocity is None:
-        nodes[:, 1, :, n:x] = np.eye(n)
-        nodes[:, 3] = J[:, n:]
-    else:
-        nodes[:, 1, :, :x] = velocity[:-1]
-        nodes[:, 3] = velocity[1:] @ J
+    nodes[:, 1, :, :x] = velocity[:-1]
     nodes[:, 2] = J[:, :n]
+    nodes[:, 3] = velocity[1:] @ J
     found: Floats = rule[:, 1:].reshape(-1, 4) @ nodes.reshape(N, 4, n * Z)
     return found.reshape(N, len(rule), x, Z)
 
 
-def after_impulse(rule: Floats, hessian: Floats, velocity: Floats | None, dt: float) -> Floats:
+def after_impulse(rule: Floats, hessian: Floats, velocity: Floats, dt: float) -> Floats:
     """Hessian (N, 2n, 2n) of each step's running cost in the state after its noise impulse.
 
     Args:
@@ -57,7 +52,12 @@ def after_impulse(rule: Floats, hessian: Floats, velocity: Floats | None, dt: fl
 
 
 def beyond_samples(
-    problem: OptimalControlProblem, motion: Trajectory, lin: Linearization, hessian: Floats, velocity: Floats
+    problem: OptimalControlProblem,
+    motion: Trajectory,
+    lin: Linearization,
+    hessian: Floats,
+    velocity: Floats,
+    terminal: Floats,
 ) -> Floats | None:
     """The Hessian (N, 2n, 2n), in the noise's jump of the state after a step, of what velocities cost within the step.
 
@@ -75,12 +75,13 @@ def beyond_samples(
         lin: Its linearized steps.
         hessian: Hessians (N, s, 2n, 2n) of the running cost in (q, v) at the samples.
         velocity: dv/dx (N + 1, n, 2n) at the nodes, in momenta.
+        terminal: Hessian (2n, 2n) of the terminal cost in (q, v).
 
     Raises:
         LinearizationError: Velocities grow without bound within a step.
     """
     n, h = problem.scene.robot.dof, problem.dt
-    end = problem.expand_terminal(motion).hessian[0, n : 2 * n, n : 2 * n]
+    end = terminal[n:, n:]
     of_speeds = np.zeros(hessian.shape)
     of_speeds[..., n:, n:] = hessian[..., n:, n:]
     held = problem.integrator.holds_noise and problem.sampling != "start" and not problem.scene.constraints

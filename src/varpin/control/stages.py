@@ -235,9 +235,15 @@ class Steps:
         return found
 
     @cached_property
+    def _at_samples(self) -> tuple[Floats, Floats, Floats]:
+        """q, v and u at the samples."""
+        motion = self.trajectory
+        return self.problem.samples(motion.q, motion.v, self.problem.control_rows(motion))
+
+    @cached_property
     def running(self) -> Expansion:
         """The running cost at its samples."""
-        found = self.problem.expand_running(self.trajectory)
+        found = self.problem.running.expand(*self._at_samples)
         for name, array in (("gradient", found.gradient), ("Hessian", found.hessian)):
             if not np.isfinite(array).all():
                 raise CostError(repr(self.problem.cost), f"its {name} along the motion is not finite")
@@ -252,7 +258,8 @@ class Steps:
     @cached_property
     def terminal(self) -> Terminal:
         """The terminal cost at the end of the motion."""
-        end, x = self.problem.expand_terminal(self.trajectory), slice(0, 2 * self.problem.scene.robot.dof)
+        problem, motion, x = self.problem, self.trajectory, slice(0, 2 * self.problem.scene.robot.dof)
+        end = problem.terminal.expand(motion.q[-1:], motion.v[-1:], np.zeros((1, problem.scene.controls)))
         # Contiguous, as the core takes them.
         cost = Expansion(end.gradient[:1, x], np.ascontiguousarray(end.hessian[:1, x, x]))
         D = self.slopes[-1]
@@ -267,18 +274,12 @@ class Steps:
         return problem.rate.expand(problem.decided(self.trajectory), problem.period)
 
     @cached_property
-    def slack(self) -> Floats:
-        """Distances (R, 2, m) of the controls from their limits."""
-        found: Floats = self.problem.control_limits - self.problem.decided(self.trajectory)[:, None]
-        return found
-
-    @cached_property
     def costs(self) -> tuple[Floats, Floats]:
         """Gradients (N, Z) and Hessians (N, Z, Z) of the running cost of each step in its variables."""
         problem, rule, m = self.problem, self.problem.rule, self.problem.scene.controls
         N, x, Z = self.J.shape
         D = np.zeros((N, len(rule), x + m, Z))
-        D[:, :, :x] = at_samples(rule, self.J, self._velocity if problem.integrator.variational else None)
+        D[:, :, :x] = at_samples(rule, self.J, self.slopes[:, x // 2 :])
         late = problem.places if problem.linear else np.ones(len(rule))
         D[:, :, x:, x : x + m] = (1.0 - late)[:, None, None] * np.eye(m)
         D[:, :, x:, Z - m :] = late[:, None, None] * np.eye(m)
@@ -292,14 +293,15 @@ class Steps:
         """Of :attr:`kicked` (N, 2n, 2n) per dt what no sample sees, and so no path; None if nothing."""
         x = 2 * self.problem.scene.robot.dof
         hessian = self._hessians[:, :, :x, :x]
-        return beyond_samples(self.problem, self.trajectory, self.lin, hessian, self._velocity)
+        end = self.terminal.cost.hessian[0]
+        return beyond_samples(self.problem, self.trajectory, self.lin, hessian, self._velocity, end)
 
     @cached_property
     def kicked(self) -> Floats:
         """Hessians (N, 2n, 2n) of what the noise of a step costs within it, in its effect on the state after it."""
         x, problem = 2 * self.problem.scene.robot.dof, self.problem
-        velocity = self._velocity if problem.integrator.variational else None
-        found = after_impulse(problem.rule, self._hessians[:, :, :x, :x], velocity, problem.dt)
+        hessian, velocity = self._hessians[:, :, :x, :x], self.slopes[:, x // 2 :]
+        found = after_impulse(problem.rule, hessian, velocity, problem.dt)
         return problem.dt * (found if self.beyond is None else found + self.beyond)
 
     def of_noise(self, spread: Floats) -> tuple[Floats, Floats]:
@@ -403,7 +405,7 @@ class Steps:
     def _models(self) -> tuple[tuple[float, Expansion, Floats], ...]:
         """Weights, expansions and variables of the cost at the samples, (q, v, u), and at the end, (q, v)."""
         problem, motion = self.problem, self.trajectory
-        along = np.concatenate(problem.samples(motion.q, motion.v, problem.control_rows(motion)), axis=1)
+        along = np.concatenate(self._at_samples, axis=1)
         end = np.concatenate([motion.q[-1:], motion.v[-1:]], axis=1)
         return (problem.dt * float(problem.rule[0, 0]), self.running, along), (1.0, self.terminal.cost, end)
 
