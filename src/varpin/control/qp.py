@@ -55,7 +55,7 @@ class Program:
         layout = steps.layout
         self._layout, self._equalities = layout, [row.equality for row in rows]
         self._forms: dict[float | None, _Form] = {}  # by the weight of the rows
-        at, beside = layout.decisions(plan.feedback, plan.previous)
+        at, beside = layout.decision, plan.beside
         Quu = _products(plan.factors)
         diagonal = np.diagonal(Quu, axis1=1, axis2=2)
         pull = np.swapaxes(beside, 1, 2) @ Quu
@@ -71,13 +71,11 @@ class Program:
         self._gradient = np.zeros(layout.size)
         np.add.at(self._gradient, at[at >= 0], gradient[at >= 0] / self._scale)
         self._lower, self._upper = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
-        controls = layout.control(np.arange(len(plan.feedforward)))
+        controls, after = layout.control[:-1], layout.state[1:]
         self._lower[controls], self._upper[controls] = limits
-        k = np.arange(layout.stages)
-        after = layout.state(k + 1)
         numbers = np.arange(after.size).reshape(after.shape)
         self._hessian = _rectangle(at, at, hessian / self._scale)
-        self._dynamics = [_rectangle(numbers, layout.in_stage(k), steps.J), (numbers, after, -np.ones(after.shape))]
+        self._dynamics = [_rectangle(numbers, layout.stage, steps.J), (numbers, after, -np.ones(after.shape))]
         self._rows = [(row.at, row.slopes) for row in rows]
 
     def minimum(
@@ -90,8 +88,8 @@ class Program:
             gaps: What the stages miss the states by at z = 0 (R, 2n); zero by default.
             weight: Cost of a violation of each row by one; by default rows are hard.
         """
-        layout = self._layout
-        still = np.zeros(layout.stages * layout.states) if gaps is None else gaps.ravel()
+        size = self._layout.size
+        still = np.zeros(self._layout.state[1:].size) if gaps is None else gaps.ravel()
         b, h = [still], [np.zeros(0)]
         for equality, c in zip(self._equalities, values, strict=True):
             (b if equality else h).append(-c)
@@ -109,11 +107,11 @@ class Program:
             ),
         )
         multipliers = tuple(next(own) if equality else next(push) for equality in self._equalities)
-        return Minimum(z[: layout.size], multipliers, float(z[layout.size :].sum()))
+        return Minimum(z[:size], multipliers, float(z[size:].sum()))
 
     def _form(self, weight: float | None) -> _Form:
         """The matrices of the program with hard rows, or of a weight."""
-        size, first = self._layout.size, [self._layout.stages * self._layout.states, 0]
+        size, first = self._layout.size, [self._layout.state[1:].size, 0]
         parts, slacks, places = [list(self._dynamics), list[_Entries]()], list[_Entries](), [np.arange(size)]
         for equality, (at, slopes) in zip(self._equalities, self._rows, strict=True):
             i, kind = np.arange(len(at))[:, None], 0 if equality else 1

@@ -56,6 +56,16 @@ class Plan(NamedTuple):
         return self.gains[:, :, x : x + m] if x < X else None
 
     @property
+    def beside(self) -> Floats:
+        """Derivatives (R, m, 2n + 2m) of u - K x - G w, the changes of controls u beside feedback.
+
+        K is on the state x where a held control, or the line to a linear one, begins, G on the previous control w.
+        """
+        R, m, _ = self.gains.shape
+        own = np.broadcast_to(np.eye(m), (R, m, m))
+        return np.concatenate([-self.feedback, 0.0 * own if self.previous is None else -self.previous, own], axis=2)
+
+    @property
     def expected_decrease(self) -> float:
         """Decrease of the expected cost with a full step, by the model."""
         # The step is the model's minimum, where the curvature is -slope.
@@ -138,8 +148,8 @@ def foreseen(steps: Steps, plan: Plan) -> tuple[Floats, bool]:
     limited = core.foresee(
         problem.hold, given.J[:, :, :X], given.J[:, :, X:], plan.feedforward, plan.gains, slack, moves, after
     )
-    x = np.vstack([np.zeros((1, layout.states)), after[:, : layout.states]])
-    return layout.joined(x[-layout.stages - 1 :], moves), limited
+    x = np.vstack([np.zeros((1, plan.states)), after[:, : plan.states]])
+    return layout.joined(x[-problem.steps - 1 :], moves), limited
 
 
 def noise_shares(problem: OptimalControlProblem, motion: Trajectory, plan: Plan) -> Floats:

@@ -335,7 +335,7 @@ class Search:
         ]
         linear, whole = change(self.quadratic, found.z)
         removed = self.weight * (bad - found.slack)
-        gradient = along.layout.controls_of(along.lagrangian(self.quadratic, rows, found.multipliers))
+        gradient = along.lagrangian(self.quadratic, rows, found.multipliers)[along.layout.control[:-1]]
         self.step = Step(self._feedforward(found.z), gradient, linear - removed, removed - whole, found, elastic)
         return True
 
@@ -363,9 +363,9 @@ class Search:
 
     def _feedforward(self, z: Floats) -> Floats:
         """The changes of the controls in z, without what feedback gives for its states."""
-        plan = self.plan
-        at, beside = self.along.layout.decisions(plan.feedback, plan.previous)
-        return (beside @ np.where(at >= 0, z[at], 0.0)[:, :, None])[:, :, 0]
+        changes = self.plan.beside @ np.append(z, 0.0)[self.along.layout.decision][:, :, None]
+        feedforward: Floats = changes[:, :, 0]
+        return feedforward
 
     def _costates(self) -> Floats:
         """Derivatives (N, 2n) of the Lagrangian in the state after each step, with the known multipliers."""
@@ -374,8 +374,7 @@ class Search:
             if push.any() and not item.of_controls:
                 rows.append(along.rows(item))
                 pushes.append(push.ravel() * item.scale)
-        after = along.layout.state(np.arange(1, self.problem.steps + 1))
-        return along.lagrangian(along.quadratic(), rows, pushes)[after]
+        return along.lagrangian(along.quadratic(), rows, pushes)[along.layout.state[1:]]
 
     def _ended(self, tolerance: float) -> Status | None:
         """The status of a search whose step gains no more than the tolerance; None if it goes on."""
@@ -513,7 +512,7 @@ class Search:
         now = problem.decided(self.trajectory)
         u, gains, previous = now + length * feedforward, plan.feedback, plan.previous
         if z is not None and problem.limited:
-            aim = now + length * self.along.layout.controls_of(z)
+            aim = now + length * z[self.along.layout.control[:-1]]
             for limit, sign in zip(problem.control_limits, (-1.0, 1.0), strict=True):
                 there = np.isfinite(limit) & (sign * (aim - limit) >= -TRACE * np.abs(limit))
                 u, gains = np.where(there, limit, u), np.where(there[:, :, None], 0.0, gains)

@@ -106,58 +106,36 @@ class Recursion(NamedTuple):
 class Layout(NamedTuple):
     """Where the variables of a problem are: z = (u_0, x_1, ..., x_hold, u_1, ...), and at the end a linear control."""
 
-    states: int  # 2n
-    controls: int  # m
-    stages: int  # N, the number of steps
-    hold: int  # steps that share a control
-    linear: bool  # whether there is a control at the end
+    state: Integers  # (N + 1, 2n); -1 for the first one, which is given
+    control: Integers  # (R + 1, m); the last row is -1, for the control before the horizon
+    stage: Integers  # (N, Z) of the variables of steps: (x, u), or (x, w, u) of linear controls
+    decision: Integers  # (R, 2n + 2m) of x where a control, or the line to it, begins, the control before, and its own
+    size: int  # the number of variables
 
-    @property
-    def _span(self) -> int:
-        """The number of variables of a decision and the states after it."""
-        return self.controls + self.hold * self.states
-
-    @property
-    def size(self) -> int:
-        """The number of variables."""
-        return self.stages // self.hold * self._span + self.linear * self.controls
-
-    def state(self, k: Integers) -> Integers:
-        """Indices (K, 2n) of states at nodes; -1 for the first one, which is given."""
-        decision, step = np.divmod(k - 1, self.hold)
-        own = (decision * self._span + self.controls + step * self.states)[:, None] + np.arange(self.states)
-        return np.where(k[:, None] > 0, own, -1)
-
-    def control(self, r: Integers) -> Integers:
-        """Indices (K, m) of controls; -1 for that before the horizon."""
-        return np.where(r[:, None] >= 0, (r * self._span)[:, None] + np.arange(self.controls), -1)
-
-    def in_stage(self, k: Integers) -> Integers:
-        """Indices (K, Z) of the variables of steps: (x, u), or (x, w, u) of linear controls."""
-        ends = (k, k + 1) if self.linear else (k // self.hold,)
-        return np.concatenate([self.state(k), *map(self.control, ends)], axis=1)
-
-    def decisions(self, feedback: Floats, previous: Floats | None) -> tuple[Integers, Floats]:
-        """The changes of controls beside feedback, u - K x - G w: indices (R, Z) and derivatives (R, m, Z).
-
-        K (R, m, 2n) is on the state where a held control, or the line to a linear one, begins, G (R, m, m) on the
-        previous control w.
-        """
-        R, m, _ = feedback.shape
-        r = np.arange(R)
-        w = np.zeros((R, m, m)) if previous is None else previous
-        at = np.concatenate([self.state((r - self.linear) * self.hold), self.control(r - 1), self.control(r)], axis=1)
-        return at, np.concatenate([-feedback, -w, np.broadcast_to(np.eye(m), w.shape)], axis=2)
-
-    def controls_of(self, z: Floats) -> Floats:
-        """The changes of the controls (R, m) in z."""
-        return z[self.control(np.arange(self.stages // self.hold + self.linear))]
+    @classmethod
+    def of(cls, problem: OptimalControlProblem) -> Layout:
+        """The layout of a problem."""
+        N, hold, R, linear = problem.steps, problem.hold, problem.decisions, problem.linear
+        m, x = problem.scene.controls, 2 * problem.scene.robot.dof
+        span, step, own = m + hold * x, np.arange(N), np.arange(R)
+        state, control = np.full((N + 1, x), -1), np.full((R + 1, m), -1)
+        state[1:] = (step // hold * span + m + step % hold * x)[:, None] + np.arange(x)
+        control[:-1] = (own * span)[:, None] + np.arange(m)
+        ends = (control[step], control[step + 1]) if linear else (control[step // hold],)
+        begin = state[np.maximum(own - linear, 0) * hold]
+        return cls(
+            state,
+            control,
+            np.concatenate([state[:-1], *ends], axis=1),
+            np.concatenate([begin, control[own - 1], control[own]], axis=1),
+            N // hold * span + linear * m,
+        )
 
     def joined(self, states: Floats, controls: Floats) -> Floats:
         """The variables of changes of the states (N + 1, 2n) and of the controls (R, m)."""
         z = np.empty(self.size)
-        z[self.state(np.arange(1, self.stages + 1))] = states[1:]
-        z[self.control(np.arange(len(controls)))] = controls
+        z[self.state[1:]] = states[1:]
+        z[self.control[:-1]] = controls
         return z
 
 
@@ -181,7 +159,7 @@ def change(costs: Sequence[Cost], z: Floats) -> tuple[float, float]:
     """The slope of costs along z, and their change at z by the quadratic model."""
     padded, slope, curvature = np.append(z, 0.0), 0.0, 0.0
     for at, gradient, hessian in costs:
-        moved = np.where(at >= 0, padded[at], 0.0)
+        moved = padded[at]
         slope += float((gradient * moved).sum())
         curvature += float((moved * (hessian @ moved[:, :, None])[:, :, 0]).sum())
     return slope, slope + 0.5 * curvature
@@ -412,8 +390,7 @@ class Steps:
     @cached_property
     def layout(self) -> Layout:
         """Where the variables are."""
-        problem, m = self.problem, self.problem.scene.controls
-        return Layout(2 * problem.scene.robot.dof, m, problem.steps, problem.hold, problem.linear)
+        return Layout.of(self.problem)
 
     def quadratic(self, spread: Floats | None = None, curvature: Floats | None = None) -> list[Cost]:
         """The costs of the steps, of the end and of control changes, (O10).
@@ -425,11 +402,10 @@ class Steps:
             gradient, hessian = (a + b for a, b in zip((gradient, hessian), self.of_noise(spread), strict=True))
         if curvature is not None:
             hessian = hessian + curvature
-        costs = [Cost(layout.in_stage(np.arange(layout.stages)), gradient, hessian)]
-        end, (pull, rate), r = self.terminal, self.rate, np.arange(len(self.rate[0]))
-        costs.append(Cost(layout.state(np.array([layout.stages])), end.gradient[None], end.hessian[None]))
+        costs, end, (pull, rate) = [Cost(layout.stage, gradient, hessian)], self.terminal, self.rate
+        costs.append(Cost(layout.state[-1:], end.gradient[None], end.hessian[None]))
         if len(rate):
-            at = np.concatenate([layout.control(r - 1), layout.control(r)], axis=1)
+            at = layout.decision[:, layout.state.shape[1] :]
             costs.append(Cost(at, np.concatenate([-pull, pull], axis=1), np.block([[rate, -rate], [-rate, rate]])))
         return costs
 
@@ -443,19 +419,19 @@ class Steps:
         layout, motion = self.layout, self.trajectory
         if isinstance(bound, BoundRate):
             columns = bound.limited
-            at = np.stack([layout.control(bound.places - 1)[:, columns], layout.control(bound.places)[:, columns]], 2)
+            at = np.stack([layout.control[bound.places - back][:, columns] for back in (1, 0)], axis=2)
             pair = np.broadcast_to(np.array([-1.0, 1.0]) / bound.period, at.shape)
             return np.concatenate([at, at], axis=1).reshape(-1, 2), np.concatenate([pair, -pair], 1).reshape(-1, 2)
         if isinstance(bound, BoundBetween) and bound.ends is not None:
             J = bound.slopes(motion.q, motion.v, self.problem.control_rows(motion))
-            begins, x = bound.places - 1, layout.states
-            at = layout.in_stage(begins)
+            begins, x = bound.places - 1, layout.state.shape[1]
+            at = layout.stage[begins]
             J = np.concatenate([J[:, :, :x] @ self.slopes[begins], J[:, :, x:]], axis=2)
         else:
             nodes, slopes = [bound.places], [bound.jacobian(motion.q, motion.v)]
             if isinstance(bound, BoundBetween):
                 nodes, slopes = [bound.places - 1, bound.places], bound.by_nodes(slopes[0])
-            at = np.concatenate([layout.state(k) for k in nodes], axis=1)
+            at = np.concatenate([layout.state[k] for k in nodes], axis=1)
             J = np.concatenate([part @ self.slopes[k] for k, part in zip(nodes, slopes, strict=True)], axis=2)
         return np.repeat(at, len(bound.rows), axis=0), J.reshape(-1, J.shape[2])
 
@@ -467,15 +443,12 @@ class Steps:
             np.add.at(total, at, gradient)
         for row, push in zip(rows, multipliers, strict=True):
             np.add.at(total, row.at, push[:, None] * row.slopes)
-        at = layout.in_stage(np.arange(layout.stages))
-        for k in range(layout.stages - 1, -1, -1):
-            np.add.at(total, at[k], self.J[k].T @ total[layout.state(np.array([k + 1]))[0]])
+        for k in range(len(self.J) - 1, -1, -1):
+            np.add.at(total, layout.stage[k], self.J[k].T @ total[layout.state[k + 1]])
         return total
 
     def gaps_of(self, z: Floats) -> Floats:
         """What the linearized stages miss the states in z by (R, 2n)."""
-        k, padded = np.arange(self.layout.stages), np.append(z, 0.0)
-        at = self.layout.in_stage(k)
-        moved = np.where(at >= 0, padded[at], 0.0)
-        found: Floats = (self.J @ moved[:, :, None])[:, :, 0] - z[self.layout.state(k + 1)]
+        moved = np.append(z, 0.0)[self.layout.stage]
+        found: Floats = (self.J @ moved[:, :, None])[:, :, 0] - z[self.layout.state[1:]]
         return found
