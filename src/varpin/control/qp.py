@@ -40,17 +40,11 @@ class Program:
     ) -> None:
         """Assemble the matrices.
 
-        The cost is that of the changes v = u - K x of the controls beside a backward pass's feedback: half of
-        (v - k)' Quu (v - k) for each decision, with k the feed-forward part. That is the cost of the stages up to a
-        constant, and the solver has neither large multipliers nor far apart weights to cope with.
-
-        Args:
-            steps: The steps of the motion.
-            rows: The rows of all constraints.
-            limits: Least and greatest changes of the controls, each (R, m).
-            plan: A backward pass along the motion, of the costs alone.
-            regularization: A further cost of half the squares of the controls' changes, relative to the diagonal of
-                Quu.
+        The cost is that of the changes v = u - K x of the controls beside the feedback of ``plan``, a backward pass of
+        the costs alone: half of (v - k)' Quu (v - k) for each decision, with k the feed-forward part. That is the cost
+        of the steps up to a constant, and the solver has neither large multipliers nor far apart weights to cope with.
+        ``limits`` are the least and greatest changes of the controls, each (R, m). The ``regularization`` is a further
+        cost of half their squares, relative to the diagonal of Quu.
         """
         layout = steps.layout
         self._layout, self._equalities = layout, [row.equality for row in rows]
@@ -83,10 +77,8 @@ class Program:
     ) -> Minimum | None:
         """The minimum within limits and rows; None where there is none or the solver fails.
 
-        Args:
-            values: Values (P,) of the rows of each constraint at z = 0.
-            gaps: What the stages miss the states by at z = 0 (R, 2n); zero by default.
-            weight: Cost of a violation of each row by one; by default rows are hard.
+        At z = 0 rows have ``values`` (P,), for each constraint, and steps miss the states by ``gaps`` (N, 2n).
+        ``weight`` is the cost of a violation of each row by one; by default rows are hard.
         """
         size = self._layout.size
         still = np.zeros(self._layout.state[1:].size) if gaps is None else gaps.ravel()

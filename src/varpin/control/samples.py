@@ -37,11 +37,8 @@ def at_samples(rule: Floats, J: Floats, velocity: Floats) -> Floats:
 def after_impulse(rule: Floats, hessian: Floats, velocity: Floats, dt: float) -> Floats:
     """Hessian (N, 2n, 2n) of each step's running cost in the state after its noise impulse.
 
-    Args:
-        rule: The sampling rule.
-        hessian: Hessians (N, s, 2n, 2n) of the cost in (q, v) at the samples.
-        velocity: As for :func:`at_samples`.
-        dt: The time step [s].
+    ``hessian`` (N, s, 2n, 2n) are those of the cost in (q, v) at the samples, ``velocity`` is as for
+    :func:`at_samples`.
     """
     N, x = len(hessian), hessian.shape[-1]
     late = rule.copy()
@@ -69,13 +66,8 @@ def beyond_samples(
     step, by :func:`_left_at_end`. None where there is nothing to add: without noise or costs of velocities, for
     impulses, for sums over nodes (``sampling="start"``), and under constraints of the scene.
 
-    Args:
-        problem: The problem.
-        motion: The motion.
-        lin: Its linearized steps.
-        hessian: Hessians (N, s, 2n, 2n) of the running cost in (q, v) at the samples.
-        velocity: dv/dx (N + 1, n, 2n) at the nodes, in momenta.
-        terminal: Hessian (2n, 2n) of the terminal cost in (q, v).
+    ``hessian`` (N, s, 2n, 2n) are those of the running cost in (q, v) at the samples, ``terminal`` (2n, 2n) that of the
+    terminal cost. ``velocity`` is dv/dx (N + 1, n, 2n) at the nodes, in momenta.
 
     Raises:
         LinearizationError: Velocities grow without bound within a step.

@@ -84,11 +84,8 @@ class Step(NamedTuple):
 class Search:
     """The state of a search: the motion, its multipliers and the history.
 
-    Args:
-        problem: The problem.
-        second_order: Whether second derivatives of the steps count where the model stays convex.
-        regularization: The first one, relative to the diagonal of Quu.
-        tick: Whether it is a controller's: margins stay, and there are rows in the middles of steps alone.
+    Options are those of :func:`varpin.solve`. In a controller's ``tick`` margins stay, and there are rows in the
+    middles of steps alone.
     """
 
     def __init__(

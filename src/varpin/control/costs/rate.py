@@ -96,10 +96,7 @@ class ControlRate(Frozen):
 def control_rate(cost: Cost, controls: int, joints: Sequence[str] | None = None) -> ControlRate | None:
     """The sum of a cost's terms on the rate of m controls; None if there is none.
 
-    Args:
-        cost: The cost.
-        controls: m.
-        joints: The joint whose force each control is; None where controls are something else.
+    ``joints`` are those whose force each control is; None where controls are something else.
 
     Raises:
         UnknownJoint: A name that is no driven joint's.
