@@ -499,10 +499,6 @@ class OptimalControlProblem(Frozen):
             return at_q, at_v, np.ascontiguousarray(between.reshape(*at_q.shape[:-1], u.shape[-1]))
         return at_q, at_v, u if len(self.rule) == 1 else np.repeat(u, len(self.rule), axis=-2)
 
-    def _end(self, q: Floats, v: Floats) -> tuple[Floats, Floats, Floats]:
-        """The last state of motions, and no control."""
-        return q[..., -1:, :], v[..., -1:, :], np.zeros((*q.shape[:-2], 1, self.scene.controls))
-
     def costs(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """The cost (...) of motions without noise terms: q and v (..., N + 1, n), u (..., N, m)."""
         total: Floats = self._shares(q, v, u).sum(axis=-1)
@@ -534,10 +530,10 @@ class OptimalControlProblem(Frozen):
         return self._shares(trajectory.q, trajectory.v, self.control_rows(trajectory))
 
     def _shares(self, q: Floats, v: Floats, u: Floats) -> Floats:
-        # All samples of a rule have the same weight.
-        weight = self.dt * self.rule[0, 0]
+        # All samples of a rule have the same weight; there is no control at the end.
+        weight, none = self.dt * self.rule[0, 0], np.zeros((*q.shape[:-2], 1, self.scene.controls))
         found = [weight * part for part in self.running.shares(*self.samples(q, v, u))]
-        found += self.terminal.shares(*self._end(q, v))
+        found += self.terminal.shares(q[..., -1:, :], v[..., -1:, :], none)
         if self.rate is not None:
             found.append(self.rate.shares(u[..., :: self.hold, :], self.period))
         return np.concatenate([part.reshape(*q.shape[:-2], -1) for part in found], axis=-1)
@@ -545,11 +541,13 @@ class OptimalControlProblem(Frozen):
     def not_finite(self, trajectory: Trajectory) -> tuple[Cost, ...]:
         """The cost terms that are not finite on a motion; those of the controls' rate are not tested."""
         q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
+        places = self.samples(q, v, u), (q[-1:], v[-1:], np.zeros((1, self.scene.controls)))
+        found = list[Cost]()
         # The parts of both sums are in the order of the cost's terms.
-        pairs = ((self.running, self.samples(q, v, u)), (self.terminal, self._end(q, v)))
-        values = [part.value(*at) for bound, at in pairs for _, part in bound.parts]
-        terms = [term for at_end in (0, 1) for term in _placed(self.cost, at_end)]
-        return tuple(term for term, own in zip(terms, values, strict=True) if not np.isfinite(own).all())
+        for at_end, (bound, at) in enumerate(zip((self.running, self.terminal), places, strict=True)):
+            finite = [np.isfinite(part.value(*at)).all() for _, part in bound.parts]
+            found += [term for term, is_so in zip(_placed(self.cost, at_end), finite, strict=True) if not is_so]
+        return tuple(found)
 
     def simulate(
         self,

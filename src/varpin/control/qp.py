@@ -50,7 +50,8 @@ class Program:
         self._layout, self._equalities = layout, [row.equality for row in rows]
         self._forms: dict[float | None, _Form] = {}  # by the weight of the rows
         at, beside = layout.decision, plan.beside
-        Quu = _products(plan.factors)
+        L = np.tril(plan.factors, -1) + np.eye(plan.factors.shape[1])
+        Quu = L * np.diagonal(plan.factors, axis1=1, axis2=2)[:, None, :] @ np.swapaxes(L, 1, 2)
         diagonal = np.diagonal(Quu, axis1=1, axis2=2)
         pull = np.swapaxes(beside, 1, 2) @ Quu
         hessian = pull @ beside
@@ -164,13 +165,6 @@ def changes(rows: Sequence[Rows], z: Floats) -> list[Floats]:
     """Changes (P,) of the values of all rows at z."""
     padded = np.append(z, 0.0)
     return [(row.slopes * padded[row.at]).sum(axis=1) for row in rows]
-
-
-def _products(factors: Floats) -> Floats:
-    """The matrices L D L' (R, m, m) of factors that hold L below and D on their diagonals."""
-    L = np.tril(factors, -1) + np.eye(factors.shape[1])
-    found: Floats = L * np.diagonal(factors, axis1=1, axis2=2)[:, None, :] @ np.swapaxes(L, 1, 2)
-    return found
 
 
 _Entries = tuple[Integers, Integers, Floats]

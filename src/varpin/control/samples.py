@@ -82,7 +82,12 @@ def beyond_samples(
     found = -after_impulse(problem.rule, of_speeds, velocity, h)
     by_momenta, to_impulse = velocity[:, :, n:], np.linalg.pinv(lin.J[:, n:])
     whole = np.einsum("s,Nsab->Nab", h * problem.rule[:, 0], hessian[..., n:, n:])
-    begin, after = (D @ M for D, M in zip(_damping(problem, motion), (by_momenta[:-1], by_momenta[1:]), strict=True))
+    # The damping where steps begin and where they end; friction that falls with velocity is left out.
+    forces = motion.u @ problem.scene.actuation.T
+    begin, after = (
+        damping_matrices(problem.scene, motion.q[part], motion.v[part], forces, custom=True) @ by_momenta[part]
+        for part in (slice(None, -1), slice(1, None))
+    )
     decay = 0.5 * h * (begin + after)
     # A step in which velocities grow without bound, as in a trial that runs away, has no mean.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -94,16 +99,6 @@ def beyond_samples(
         step = int(lost.argmax())
         raise LinearizationError(step, step * h, "what noise adds to velocities grows without bound within the step")
     return found
-
-
-def _damping(problem: OptimalControlProblem, motion: Trajectory) -> tuple[Floats, Floats]:
-    """The damping (N, n, n) where steps begin and where they end: friction that falls with velocity is left out."""
-    scene, forces = problem.scene, motion.u @ problem.scene.actuation.T
-    begin, end = (
-        damping_matrices(scene, motion.q[part], motion.v[part], forces, custom=True)
-        for part in (slice(None, -1), slice(1, None))
-    )
-    return begin, end
 
 
 def _left_at_end(problem: OptimalControlProblem, Z: Floats, P: Floats) -> Floats:

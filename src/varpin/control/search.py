@@ -136,14 +136,13 @@ class Search:
 
     def resume(self, plan: Solution) -> None:
         """Continue from the state of a plan."""
-        state, known = plan.search, plan.multipliers
+        state, known, second_order = plan.search, plan.multipliers, self.second_order
         assert state is not None
         self._move(plan.trajectory, self.problem.shares(plan.trajectory))
-        second_order = self.second_order or state.second_order
         for owner, names in ((self, _KEPT), (self.tightening, _OF_MARGINS)):
             for name in names:
                 setattr(owner, name, getattr(state, name))
-        self.second_order = second_order
+        self.second_order |= second_order
         self.history = list(plan.history[: state.iterations])
         if known is not None:
             self.take(known)
@@ -159,7 +158,9 @@ class Search:
         """Iterate to the end."""
         last, longest = len(self.history) + max_iterations, 0.0
         while True:
-            self.state = self._state()
+            own: dict[str, Any] = {name: getattr(self, name) for name in _KEPT}
+            margins = {name: getattr(self.tightening, name) for name in _OF_MARGINS}
+            self.state = SearchState(**own, **margins, iterations=len(self.history))
             started = time.perf_counter()
             try:
                 while not self._made():
@@ -243,11 +244,6 @@ class Search:
         self.multipliers = [np.zeros(item.shape) for item in self.bound]
         self.tightening.enforce(self.bound, between)
         self._excess: list[Floats] = [np.zeros(item.size) for item in self.bound]  # in tenths of ranges
-
-    def _state(self) -> SearchState:
-        own: dict[str, Any] = {name: getattr(self, name) for name in _KEPT}
-        margins = {name: getattr(self.tightening, name) for name in _OF_MARGINS}
-        return SearchState(**own, **margins, iterations=len(self.history))
 
     def _made(self) -> bool:
         """Make feedback, rows and the step of the motion with the present regularization; whether there is one."""

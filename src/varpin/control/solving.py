@@ -155,7 +155,12 @@ def solve(
         for name, given in (("controls", controls), ("states", states), ("true_cost", true_cost)):
             if given is not None:
                 raise InputError(f"resume goes on with the solution's own search: leave out either {name} or resume")
-        _require_resumable(problem, resume)
+        if not isinstance(resume, Solution):
+            raise InputError(f"resume must be a Solution, got {type(resume).__name__}")
+        if resume.search is None:
+            raise InputError("resume: the solution does not hold the state of its search; give it as controls")
+        if other := problem.mismatch(resume.problem.setting, resume.trajectory, resume.cost):
+            raise InputError(f"resume: the solution is {other}; give it as controls")
     path = None if states is None else _path_of(problem, states)
     if check:
         # The search may take long where values are in wrong units.
@@ -268,16 +273,6 @@ def _gentler(problem: OptimalControlProblem) -> list[OptimalControlProblem]:
     return [widened(_SHARPENED**k) for k in range(count, 0, -1)]
 
 
-def _require_resumable(problem: OptimalControlProblem, resume: Solution) -> None:
-    """Raise an InputError unless ``resume`` is a solution of the problem with the state of its search."""
-    if not isinstance(resume, Solution):
-        raise InputError(f"resume must be a Solution, got {type(resume).__name__}")
-    if resume.search is None:
-        raise InputError("resume: the solution does not hold the state of its search; give it as controls")
-    if other := problem.mismatch(resume.problem.setting, resume.trajectory, resume.cost):
-        raise InputError(f"resume: the solution is {other}; give it as controls")
-
-
 def _path_of(problem: OptimalControlProblem, given: Any) -> _Path:
     """The states that a search starts from, checked."""
     robot, shape = problem.scene.robot, (problem.steps + 1, problem.scene.robot.dof)
@@ -313,8 +308,12 @@ def _policy_along(problem: OptimalControlProblem, path: _Path, controls: object)
         raise InputError("controls beside states must be (R, m), (m,) or by joint name, without feedback")
     scene, hold, (q, v) = problem.scene, problem.hold, path
     if controls is None:
-        torques = _joint_forces(problem, q, v) @ np.linalg.pinv(scene.actuation).T
-        u = as_moved(scene, q[hold::hold], v[hold::hold], torques)
+        at, rate = 0.5 * (q[:-1:hold] + q[hold::hold]), np.diff(q[::hold], axis=0) / problem.period
+        # What servos add to the command that their springs need to hold their positions.
+        still = at @ scene.holding.T @ scene.actuation.T
+        forces = core.inverse_dynamics(scene.core, at, rate, np.diff(v[::hold], axis=0) / problem.period)
+        forces -= scene.core.forces(at, rate, still)[0]
+        u = as_moved(scene, q[hold::hold], v[hold::hold], forces @ np.linalg.pinv(scene.actuation).T)
     else:
         u = _rows_of(problem, controls)
     u = np.clip(u, *problem.control_limits)
@@ -341,18 +340,6 @@ def _cost_under(problem: OptimalControlProblem, policy: LinearPolicy) -> float:
         return problem.cost_of(problem.simulate(policy))
     except VarpinError:
         return np.inf
-
-
-def _joint_forces(problem: OptimalControlProblem, q: Floats, v: Floats) -> Floats:
-    """The joint forces (R, n) that controls have to give over each decision, on q and v (N + 1, n)."""
-    scene, period = problem.scene, problem.period
-    q, v = q[:: problem.hold], v[:: problem.hold]
-    at = 0.5 * (q[:-1] + q[1:])
-    rate, acceleration = np.diff(q, axis=0) / period, np.diff(v, axis=0) / period
-    # What servos add to the command that their springs need to hold their positions.
-    still = at @ scene.holding.T @ scene.actuation.T
-    found: Floats = core.inverse_dynamics(scene.core, at, rate, acceleration) - scene.core.forces(at, rate, still)[0]
-    return found
 
 
 def first_commands(problem: OptimalControlProblem, controls: JointValues | LinearPolicy | Solution | None) -> Commands:
