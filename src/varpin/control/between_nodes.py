@@ -13,7 +13,7 @@ from typing import Annotated
 import numpy as np
 
 from varpin.arrays import Floats, Integers, Mask
-from varpin.control.constraints import BoundConstraint, Horizon, PlanConstraint
+from varpin.control.constraints import BoundConstraint, BoundStates, OfStates
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.sizes import FEASIBLE, SLIGHT
 from varpin.errors import LinearizationError
@@ -39,19 +39,19 @@ class BoundBetween(BoundConstraint):
     Attributes:
         problem: The problem.
         moments: The instants in a step of unit length (K,).
-        inner: The constraint, bound to a grid whose nodes after the first are the instants.
-        ends: The same for the ends of parts of the K steps; None where values are on cubics.
+        of: The constraint at the instants.
+        ends: The constraint at the ends of parts of the K steps; None where values are on cubics.
     """
 
     problem: OptimalControlProblem
     moments: Floats
-    inner: BoundConstraint
-    ends: BoundConstraint | None
+    of: OfStates
+    ends: OfStates | None
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """See :meth:`BoundConstraint.value`; for one motion. Infinite where a step fails in parts."""
         if self.ends is None:
-            return self.inner.value(*self._states(q, v), u)
+            return self.of.values(*self._states(q, v))
         found: Floats = self._in_parts(self._given(q, v, u)[None])[0]
         return found
 
@@ -68,8 +68,7 @@ class BoundBetween(BoundConstraint):
         if parts is None:
             return np.full((S, *self.shape), np.inf)
         steps = (x.reshape(S, len(first), *x.shape[1:])[:, index] for x in parts)
-        within_q, within_v = (_after_first(x.reshape(S, -1, x.shape[3])) for x in steps)
-        found = self.ends.value(within_q, within_v, np.zeros((*within_q.shape[:2], 0)))
+        found = self.ends.values(*(x.reshape(-1, x.shape[3]) for x in steps))
         return _on_parabolas(found.reshape(S, len(self.places), -1, len(self.rows)), self.moments)
 
     def slopes(self, q: Floats, v: Floats, u: Floats) -> Floats:
@@ -92,14 +91,14 @@ class BoundBetween(BoundConstraint):
         return cubics(self.moments, self.problem.dt).reshape(-1, 2, 4)
 
     def _states(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
-        """The q and v (1 + K, n) on the cubics of a motion, after any first node."""
+        """The q and v (K, n) on the cubics of a motion."""
         nodes = np.array([x[self.places - back] for back in (1, 0) for x in (q, v)])
         on_q, on_v = np.einsum("kij,jkn->ikn", self._coefficients, nodes)
-        return _after_first(on_q), _after_first(on_v)
+        return np.ascontiguousarray(on_q), np.ascontiguousarray(on_v)
 
     def jacobian(self, q: Floats, v: Floats) -> Floats:
         """dc/d(q, v) (K, rows, 2n), in the states on the cubics."""
-        return self.inner.jacobian(*self._states(q, v))
+        return self.of.jacobian(*self._states(q, v))
 
     def by_nodes(self, of_state: Floats) -> list[Floats]:
         """Derivatives (K, rows, 2n) in (q, v) at the nodes before and after, of those ``of_state`` on the cubics."""
@@ -148,10 +147,10 @@ def enforced(problem: OptimalControlProblem, instants: Instants) -> OptimalContr
     for i in instants.constraints:
         item, steps, moments = problem.bound_constraints[i], *instants.of(i)
         times = problem.t0 + problem.dt * (steps + moments)
-        inner = at_times(problem, item.source, times)
-        ends = None if instants.cubic else at_times(problem, item.source, _times(problem, steps))
+        assert isinstance(item, BoundStates)
+        ends = None if instants.cubic else item.of.at(_times(problem, steps))
         given = item.source, steps + 1, times, item.rows, item.unit, item.scale
-        found.append(BoundBetween(*given, problem, moments, inner, ends))
+        found.append(BoundBetween(*given, problem, moments, item.of.at(times), ends))
     return problem.changed(bound_constraints=tuple(found))
 
 
@@ -161,19 +160,9 @@ def _times(problem: OptimalControlProblem, steps: Integers) -> Floats:
     return found
 
 
-def at_times(problem: OptimalControlProblem, constraint: PlanConstraint, times: Floats) -> BoundConstraint:
-    """A constraint on a grid whose nodes after the first are at ``times`` (K,) [s]."""
-    scene, grid = problem.scene, np.concatenate([times[:1], times])
-    return constraint.bind(Horizon(grid, scene.robot, scene.controls, 1, scene.control_joints, None, problem.linear))
-
-
 def watched(problem: OptimalControlProblem) -> list[bool]:
-    """Which constraints may have rows between nodes: inequalities of states that hold at all nodes after the first."""
-    after = np.arange(1, problem.steps + 1)
-    return [
-        np.array_equal(item.places, after) and not (item.of_controls or item.source.equality)
-        for item in problem.bound_constraints
-    ]
+    """Which constraints may have rows between nodes: inequalities of states."""
+    return [isinstance(item, BoundStates) and not item.source.equality for item in problem.bound_constraints]
 
 
 def middles(problem: OptimalControlProblem) -> Instants:
@@ -238,11 +227,6 @@ def _in_parts(problem: OptimalControlProblem, given: Floats) -> tuple[Floats, Fl
     return within_q, within_v
 
 
-def _after_first(x: Floats) -> Floats:
-    """Nodes (..., 1 + K, n) that end with the states (..., K, n)."""
-    return np.concatenate([x[..., :1, :], x], axis=-2)
-
-
 def _seen(problem: OptimalControlProblem, motion: Trajectory) -> dict[int, Floats]:
     """The values (N, parts + 1, rows) of watched constraints at the ends of the parts of a motion's steps.
 
@@ -253,11 +237,11 @@ def _seen(problem: OptimalControlProblem, motion: Trajectory) -> dict[int, Float
     parts = _in_parts(problem, np.concatenate([motion.q[:-1], motion.v[:-1], u], axis=1))
     if parts is None:
         return {}
-    q, v = (_after_first(x.reshape(-1, x.shape[2])) for x in parts)
+    q, v = (x.reshape(-1, x.shape[2]) for x in parts)
     times, found = _times(problem, steps), {}
     for i, (item, looks) in enumerate(zip(problem.bound_constraints, watched(problem), strict=True)):
-        if looks:
-            found[i] = at_times(problem, item.source, times).value(q, v, u).reshape(len(steps), PARTS + 1, -1)
+        if looks and isinstance(item, BoundStates):
+            found[i] = item.of.at(times).values(q, v).reshape(len(steps), PARTS + 1, -1)
             if (found[i][0, 0] > FEASIBLE).any():
                 found[i][0] = -np.inf
     return found

@@ -45,15 +45,10 @@ def line_search(
 ) -> Taken:
     """The first trial along a step with a sufficient decrease of the merit, or a better one next to it.
 
-    Lengths are halved, or quartered where the parabola through the last trial's merit and slope has its minimum there
-    or before (J. E. Dennis and R. B. Schnabel, "Numerical Methods for Unconstrained Optimization and Nonlinear
-    Equations", 1983, section 6.3).
-
-    Args:
-        attempt: Makes the trial of a length.
-        slope: Of the merit along the step.
-        correct: Makes a full step again, from the motion of one; None where there is no other.
-        extends: Whether full steps may be extended.
+    ``attempt`` makes the trial of a length, ``correct`` a full step again from the motion of one, if it can, and
+    ``slope`` is that of the merit. Lengths are halved, or quartered where the parabola through the last trial's merit
+    and slope has its minimum there or before (J. E. Dennis and R. B. Schnabel, "Numerical Methods for Unconstrained
+    Optimization and Nonlinear Equations", 1983, section 6.3).
     """
     best, length, trials, last = Trial(), 0.0, 0, Trial()
     corrections = _CORRECTIONS

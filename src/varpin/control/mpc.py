@@ -19,10 +19,9 @@ from varpin.control.costs import CostError
 from varpin.control.history import Status
 from varpin.control.multipliers import ConstraintReport, Multipliers, at_nodes, flat
 from varpin.control.problem import require_problem
-from varpin.control.rollout import first_commands
 from varpin.control.search import Search
 from varpin.control.sizes import NOTABLE, TENTH
-from varpin.control.solving import searched
+from varpin.control.solving import first_commands, searched
 from varpin.control.verification import report_of
 from varpin.errors import ControlError, InputError, LinearizationError
 from varpin.finding import Finding, announce

@@ -21,7 +21,7 @@ from varpin.control.costs import (
     ControlRate,
     ControlRateCost,
     Cost,
-    Expansion,
+    CostSum,
     Points,
     control_rate,
     with_control_before,
@@ -61,8 +61,6 @@ Shape = Literal["held", "linear"]
 
 # Greatest natural frequency of the feedback of first motions, times the period of controls; from 0.1 to 0.5.
 FASTEST = 0.25
-# Arguments of a problem that another state, time or control before the horizon may change.
-_MOVED = {"q0", "v0", "t0"}
 # All that another problem may have in place of its own.
 _KEPT = ("cost", "q0", "v0", "t0", "dt", "steps", "integrator", "sampling", "hold", "controls", "control_limits",
          "constraints", "between_nodes")  # fmt: skip
@@ -209,11 +207,11 @@ class OptimalControlProblem(Frozen):
         )
         self._bind(Points(np.zeros(0), dt * steps, steps, n, m, t0, names, scene.control_joints, scene.robot))
 
-    def _bind(self, points: Points, known: tuple[BoundSum, BoundSum] | None = None) -> Self:
-        """Bind costs and constraints to the grid; of ``known`` costs, those that do not depend on time are reused."""
+    def _bind(self, points: Points) -> Self:
+        """Bind costs and constraints to the grid."""
         places, rule = _rule(self.sampling, self.dt, cubic=_cubic(self.scene))
         times = self.t0 + ((np.arange(self.steps, dtype=np.float64)[:, None] + places) * self.dt).reshape(-1)
-        running, terminal = bind_cost(self.cost, times, points, known)
+        running, terminal = bind_cost(self.cost, times, points)
         rate = control_rate(self.cost, self.scene.controls, self.scene.control_joints)
         vars(self).update(places=places, rule=rule, running=running, terminal=terminal, rate=rate)
         vars(self)["bound_constraints"] = self.constraints_on(self.dt, self.steps, self.hold)
@@ -295,7 +293,7 @@ class OptimalControlProblem(Frozen):
         """The same problem with other arguments: another discretization, initial state, cost, ...
 
         With ``dt`` alone the horizon stays, and with ``duration`` alone the step; the number of steps follows. An
-        integrator that was left out is chosen anew for the step and the state.
+        integrator that was left out is chosen anew, but stays where the state or the time changes alone.
 
         Args:
             before: The control applied before the horizon, one number, (m,) or by joint name, for
@@ -316,34 +314,18 @@ class OptimalControlProblem(Frozen):
         if "duration" in given:
             dt, steps = given.get("dt", None if "steps" in given else self.dt), given.get("steps")
             given["dt"], given["steps"] = time_steps(dt, steps, given.pop("duration"))
-        moves = given.keys() <= _MOVED
+        moves = given.keys() <= {"q0", "v0", "t0"}
         if before is not None:
             control = control_values("before", before, self.scene.control_joints, self.scene.controls)
             given["cost"] = with_control_before(given.get("cost", self.cost), control)
             kept = tuple_of("constraints", given.get("constraints", self.constraints), PlanConstraint)
             given["constraints"] = tuple(item.after(control) for item in kept)
-        if moves:
-            return self._moved(given)
         same = {name: getattr(self, name) for name in _KEPT}
-        if self.integrator_by_default:
+        if self.integrator_by_default and not moves:
             same["integrator"] = None
-        return OptimalControlProblem(self.scene, **same | given)
-
-    def _moved(self, changed: dict[str, Any]) -> OptimalControlProblem:
-        """The problem on the same grid, from another state, time or control; only what depends on them is rebuilt."""
-        scene, names = self.scene, self.scene.robot.joint_names
-        state = {name: joint_array(name, changed[name], names) for name in ("q0", "v0") if name in changed}
-        if state and scene.constraints:
-            at = {"q0": self.q0, "v0": self.v0} | state
-            state["q0"], state["v0"], _ = on_constraints(scene, at["q0"], at["v0"])
-        if "t0" in changed:
-            changed["t0"] = finite("t0", changed["t0"])
-        found = self.changed(**changed | state)
-        for array in state.values():
-            array.setflags(write=False)
-        if changed.keys() <= {"q0", "v0"}:
-            return found
-        return found._bind(replace(self.running.points, t0=found.t0), (self.running, self.terminal))
+        found = OptimalControlProblem(self.scene, **same | given)
+        by_default = self.integrator_by_default and "integrator" not in given
+        return found.changed(integrator_by_default=by_default)
 
     def in_parts(self, parts: int) -> OptimalControlProblem:
         """The problem in ``parts`` of each step, for motions under commands that are decided as in its own steps.
@@ -513,10 +495,6 @@ class OptimalControlProblem(Frozen):
             return at_q, at_v, np.ascontiguousarray(between.reshape(*at_q.shape[:-1], u.shape[-1]))
         return at_q, at_v, u if len(self.rule) == 1 else np.repeat(u, len(self.rule), axis=-2)
 
-    def _end(self, q: Floats, v: Floats) -> tuple[Floats, Floats, Floats]:
-        """The last state of motions, and no control."""
-        return q[..., -1:, :], v[..., -1:, :], np.zeros((*q.shape[:-2], 1, self.scene.controls))
-
     def costs(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """The cost (...) of motions without noise terms: q and v (..., N + 1, n), u (..., N, m)."""
         total: Floats = self._shares(q, v, u).sum(axis=-1)
@@ -548,10 +526,10 @@ class OptimalControlProblem(Frozen):
         return self._shares(trajectory.q, trajectory.v, self.control_rows(trajectory))
 
     def _shares(self, q: Floats, v: Floats, u: Floats) -> Floats:
-        # All samples of a rule have the same weight.
-        weight = self.dt * self.rule[0, 0]
+        # All samples of a rule have the same weight; there is no control at the end.
+        weight, none = self.dt * self.rule[0, 0], np.zeros((*q.shape[:-2], 1, self.scene.controls))
         found = [weight * part for part in self.running.shares(*self.samples(q, v, u))]
-        found += self.terminal.shares(*self._end(q, v))
+        found += self.terminal.shares(q[..., -1:, :], v[..., -1:, :], none)
         if self.rate is not None:
             found.append(self.rate.shares(u[..., :: self.hold, :], self.period))
         return np.concatenate([part.reshape(*q.shape[:-2], -1) for part in found], axis=-1)
@@ -559,11 +537,13 @@ class OptimalControlProblem(Frozen):
     def not_finite(self, trajectory: Trajectory) -> tuple[Cost, ...]:
         """The cost terms that are not finite on a motion; those of the controls' rate are not tested."""
         q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
+        places = self.samples(q, v, u), (q[-1:], v[-1:], np.zeros((1, self.scene.controls)))
+        found = list[Cost]()
         # The parts of both sums are in the order of the cost's terms.
-        pairs = ((self.running, self.samples(q, v, u)), (self.terminal, self._end(q, v)))
-        values = [part.value(*at) for bound, at in pairs for _, part in bound.parts]
-        terms = [term for at_end in (0, 1) for term in _placed(self.cost, at_end)]
-        return tuple(term for term, own in zip(terms, values, strict=True) if not np.isfinite(own).all())
+        for at_end, (bound, at) in enumerate(zip((self.running, self.terminal), places, strict=True)):
+            finite = [np.isfinite(part.value(*at)).all() for _, part in bound.parts]
+            found += [term for term, is_so in zip(_placed(self.cost, at_end), finite, strict=True) if not is_so]
+        return tuple(found)
 
     def simulate(
         self,
@@ -593,14 +573,6 @@ class OptimalControlProblem(Frozen):
             increments=0.0 if rng is None and increments is None else increments,
             check=False,
         )
-
-    def expand_running(self, trajectory: Trajectory) -> Expansion:
-        """Expansion of the running costs along a motion, at their samples, in (q, v, u)."""
-        return self.running.expand(*self.samples(trajectory.q, trajectory.v, self.control_rows(trajectory)))
-
-    def expand_terminal(self, trajectory: Trajectory) -> Expansion:
-        """Expansion of the terminal costs at the end of a motion, in (q, v, u)."""
-        return self.terminal.expand(*self._end(trajectory.q, trajectory.v))
 
 
 def require_problem(problem: object) -> OptimalControlProblem:
@@ -634,24 +606,13 @@ def _cubic(scene: Scene) -> bool:
     return max(scene.rates, default=-1) >= 0
 
 
-def bind_cost(
-    cost: Cost, times: Floats, horizon: Points, known: tuple[BoundSum, BoundSum] | None = None
-) -> tuple[BoundSum, BoundSum]:
-    """The running costs at ``times`` (N,) of a horizon, and the terminal costs at its end.
-
-    ``known`` are the bound costs of another horizon on the same grid; parts that do not depend on time are reused.
-    """
-    at, end = (replace(horizon, t=t) for t in (times, np.array([horizon.t0 + horizon.duration])))
-    sums = []
-    for at_end, points in enumerate((at, end)):
-        chosen = _placed(cost, at_end)
-        before = (None,) * len(chosen) if known is None else (old for _, old in known[at_end].parts)
-        parts = (
-            (term.factor, term.bind(points) if old is None or term.timed else old)
-            for term, old in zip(chosen, before, strict=True)
-        )
-        sums.append(BoundSum(tuple(parts), points))
-    return sums[0], sums[1]
+def bind_cost(cost: Cost, times: Floats, horizon: Points) -> tuple[BoundSum, BoundSum]:
+    """The running costs at ``times`` (N,) of a horizon, and the terminal costs at its end."""
+    end = np.array([horizon.t0 + horizon.duration])
+    running, terminal = (
+        CostSum(tuple(_placed(cost, at_end))).bind(replace(horizon, t=t)) for at_end, t in enumerate((times, end))
+    )
+    return running, terminal
 
 
 def _placed(cost: Cost, at_end: int) -> list[Cost]:

@@ -6,6 +6,7 @@ R. Schwan, Y. Jiang, D. Kuhn and C. N. Jones, "PIQP: a proximal interior-point q
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ import scipy.sparse as sp
 from varpin.arrays import Floats, Integers
 from varpin.control.riccati import Plan
 from varpin.control.sizes import FEASIBLE, HARMLESS, ROUNDING, TENTH
-from varpin.control.stages import Rows, Stages
+from varpin.control.stages import Rows, Steps
 
 # Residuals at which the solver stops, absolute for a cost of gradient one, and relative; from 1e-12 to 1e-10.
 _RESIDUAL = 1e-11
@@ -35,27 +36,22 @@ class Program:
     """The program (O10) of one motion; :meth:`minimum` solves it, with other values of its rows for corrections."""
 
     def __init__(
-        self, stages: Stages, rows: Sequence[Rows], limits: tuple[Floats, Floats], plan: Plan, regularization: float
+        self, steps: Steps, rows: Sequence[Rows], limits: tuple[Floats, Floats], plan: Plan, regularization: float
     ) -> None:
         """Assemble the matrices.
 
-        The cost is that of the changes v = u - K x of the controls beside a backward pass's feedback: half of
-        (v - k)' Quu (v - k) for each decision, with k the feed-forward part. That is the cost of the stages up to a
-        constant, and the solver has neither large multipliers nor far apart weights to cope with.
-
-        Args:
-            stages: The stages.
-            rows: The rows of all constraints.
-            limits: Least and greatest changes of the controls, each (R, m).
-            plan: A backward pass along the motion, of the costs alone.
-            regularization: A further cost of half the squares of the controls' changes, relative to the diagonal of
-                Quu.
+        The cost is that of the changes v = u - K x of the controls beside the feedback of ``plan``, a backward pass of
+        the costs alone: half of (v - k)' Quu (v - k) for each decision, with k the feed-forward part. That is the cost
+        of the steps up to a constant, and the solver has neither large multipliers nor far apart weights to cope with.
+        ``limits`` are the least and greatest changes of the controls, each (R, m). The ``regularization`` is a further
+        cost of half their squares, relative to the diagonal of Quu.
         """
-        layout = stages.layout
+        layout = steps.layout
         self._layout, self._equalities = layout, [row.equality for row in rows]
         self._forms: dict[float | None, _Form] = {}  # by the weight of the rows
-        at, beside = layout.decisions(plan.feedback, plan.previous)
-        Quu = _products(plan.factors)
+        at, beside = layout.decision, plan.beside
+        L = np.tril(plan.factors, -1) + np.eye(plan.factors.shape[1])
+        Quu = L * np.diagonal(plan.factors, axis1=1, axis2=2)[:, None, :] @ np.swapaxes(L, 1, 2)
         diagonal = np.diagonal(Quu, axis1=1, axis2=2)
         pull = np.swapaxes(beside, 1, 2) @ Quu
         hessian = pull @ beside
@@ -70,13 +66,11 @@ class Program:
         self._gradient = np.zeros(layout.size)
         np.add.at(self._gradient, at[at >= 0], gradient[at >= 0] / self._scale)
         self._lower, self._upper = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
-        controls = layout.control(np.arange(len(plan.feedforward)))
+        controls, after = layout.control[:-1], layout.state[1:]
         self._lower[controls], self._upper[controls] = limits
-        k = np.arange(layout.stages)
-        after = layout.state(k + 1)
         numbers = np.arange(after.size).reshape(after.shape)
         self._hessian = _rectangle(at, at, hessian / self._scale)
-        self._dynamics = [_rectangle(numbers, layout.in_stage(k), stages.J), (numbers, after, -np.ones(after.shape))]
+        self._dynamics = [_rectangle(numbers, layout.stage, steps.J), (numbers, after, -np.ones(after.shape))]
         self._rows = [(row.at, row.slopes) for row in rows]
 
     def minimum(
@@ -84,13 +78,11 @@ class Program:
     ) -> Minimum | None:
         """The minimum within limits and rows; None where there is none or the solver fails.
 
-        Args:
-            values: Values (P,) of the rows of each constraint at z = 0.
-            gaps: What the stages miss the states by at z = 0 (R, 2n); zero by default.
-            weight: Cost of a violation of each row by one; by default rows are hard.
+        At z = 0 rows have ``values`` (P,), for each constraint, and steps miss the states by ``gaps`` (N, 2n).
+        ``weight`` is the cost of a violation of each row by one; by default rows are hard.
         """
-        layout = self._layout
-        still = np.zeros(layout.stages * layout.states) if gaps is None else gaps.ravel()
+        size = self._layout.size
+        still = np.zeros(self._layout.state[1:].size) if gaps is None else gaps.ravel()
         b, h = [still], [np.zeros(0)]
         for equality, c in zip(self._equalities, values, strict=True):
             (b if equality else h).append(-c)
@@ -108,11 +100,11 @@ class Program:
             ),
         )
         multipliers = tuple(next(own) if equality else next(push) for equality in self._equalities)
-        return Minimum(z[: layout.size], multipliers, float(z[layout.size :].sum()))
+        return Minimum(z[:size], multipliers, float(z[size:].sum()))
 
     def _form(self, weight: float | None) -> _Form:
         """The matrices of the program with hard rows, or of a weight."""
-        size, first = self._layout.size, [self._layout.stages * self._layout.states, 0]
+        size, first = self._layout.size, [self._layout.state[1:].size, 0]
         parts, slacks, places = [list(self._dynamics), list[_Entries]()], list[_Entries](), [np.arange(size)]
         for equality, (at, slopes) in zip(self._equalities, self._rows, strict=True):
             i, kind = np.arange(len(at))[:, None], 0 if equality else 1
@@ -133,36 +125,28 @@ class Program:
         upper = np.append(self._upper, np.full(slack, np.inf))[order]
         P = _matrix([(rank[i], j, part) for i, j, part in squares], size, rank)
         A, G = (_matrix(own, count, rank) if own else None for own, count in zip(parts, first, strict=True))
-        return _Form(P, c, A, G, lower, upper, rank[:-1])
+        return _Form((P, c, A, G, lower, upper), rank[:-1])
 
 
+@dataclass
 class _Form:
     """A program whose right sides may change."""
 
-    def __init__(
-        self,
-        P: sp.csc_matrix,
-        c: Floats,
-        A: sp.csc_matrix | None,
-        G: sp.csc_matrix | None,
-        lower: Floats,
-        upper: Floats,
-        rank: Integers,
-    ) -> None:
-        self._given, self.rank = (P, c, A, G, lower, upper), rank
-        self._solvers: dict[Any, Any] = {}
+    given: tuple[Any, ...]  # P, c, A, G, and least and greatest z
+    rank: Integers  # of the variables in the solver's order
+    solvers: dict[Any, Any] = field(default_factory=dict)
 
     def solve(self, b: Floats, h: Floats) -> Any:
         """PIQP's result; None where there is no minimum or the solver fails."""
-        P, c, A, G, lower, upper = self._given
+        P, c, A, G, lower, upper = self.given
         most = None if G is None else h
         # Stage by stage is faster, the factors of the whole matrix are more accurate.
         for kind in (piqp.KKTSolver.sparse_multistage, piqp.KKTSolver.sparse_ldlt):
-            if kind in self._solvers:
-                solver = self._solvers[kind]
+            if kind in self.solvers:
+                solver = self.solvers[kind]
                 solver.update(b=b, h_u=most)
             else:
-                solver = self._solvers[kind] = piqp.SparseSolver()
+                solver = self.solvers[kind] = piqp.SparseSolver()
                 settings = solver.settings
                 settings.kkt_solver = kind
                 settings.eps_abs, settings.eps_rel, settings.max_iter = _RESIDUAL, _RESIDUAL, _STEPS
@@ -181,13 +165,6 @@ def changes(rows: Sequence[Rows], z: Floats) -> list[Floats]:
     """Changes (P,) of the values of all rows at z."""
     padded = np.append(z, 0.0)
     return [(row.slopes * padded[row.at]).sum(axis=1) for row in rows]
-
-
-def _products(factors: Floats) -> Floats:
-    """The matrices L D L' (R, m, m) of factors that hold L below and D on their diagonals."""
-    L = np.tril(factors, -1) + np.eye(factors.shape[1])
-    found: Floats = L * np.diagonal(factors, axis1=1, axis2=2)[:, None, :] @ np.swapaxes(L, 1, 2)
-    return found
 
 
 _Entries = tuple[Integers, Integers, Floats]

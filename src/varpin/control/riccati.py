@@ -16,7 +16,7 @@ from varpin.arrays import Floats, Mask
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.sizes import HARMLESS
 from varpin.control.square_root import RootPass, squares_of
-from varpin.control.stages import Layout, Recursion, Steps
+from varpin.control.stages import Recursion, Steps, states_of
 from varpin.integrators.base import noise_fields
 from varpin.linearization import velocity_at_nodes, velocity_curvature
 from varpin.trajectory import Trajectory
@@ -36,6 +36,15 @@ class Plan(NamedTuple):
     loss: float  # estimated relative rounding error of Quu, or of its root
     factors: Floats  # (R, m, m) L D L' of the regularized Quu
 
+    @classmethod
+    def none(cls, problem: OptimalControlProblem) -> Plan:
+        """What is known before the first pass: no feedback and no change of the controls."""
+        R, m, x = problem.decisions, problem.scene.controls, 2 * problem.scene.robot.dof
+        gains, still, noise = np.zeros((R, m, states_of(problem))), np.zeros((R, m)), problem.scene.processes
+        jumps, spread, factors = np.empty((0, x, x // 2)), np.empty((0, x, x)), np.zeros((R, m, m))
+        cost = np.nan if noise else 0.0
+        return cls(still, gains, x, np.full((R, m), np.nan), 0.0, cost, jumps, spread, 0.0, factors)
+
     @property
     def feedback(self) -> Floats:
         """Gains (R, m, 2n) on the state."""
@@ -46,6 +55,16 @@ class Plan(NamedTuple):
         """Gains (R, m, m) on the previous control, with a rate cost or linear controls."""
         x, (_, m, X) = self.states, self.gains.shape
         return self.gains[:, :, x : x + m] if x < X else None
+
+    @property
+    def beside(self) -> Floats:
+        """Derivatives (R, m, 2n + 2m) of u - K x - G w, the changes of controls u beside feedback.
+
+        K is on the state x where a held control, or the line to a linear one, begins, G on the previous control w.
+        """
+        R, m, _ = self.gains.shape
+        own = np.broadcast_to(np.eye(m), (R, m, m))
+        return np.concatenate([-self.feedback, 0.0 * own if self.previous is None else -self.previous, own], axis=2)
 
     @property
     def expected_decrease(self) -> float:
@@ -80,7 +99,7 @@ def _pass(steps: Steps, given: Recursion, regularization: float, *, second: bool
         hessian[:x, :x] += velocity_curvature(problem.scene, motion.q[-1:], motion.v[-1:], pull)[0]
     feedforward, gains, by_controls = np.empty((R, m)), np.empty((R, m, X)), np.empty((R, m))
     spread, factors = np.empty((S if k else 0, X, X)), np.empty((R, m, m))
-    given_arrays = {
+    arrays: dict[str, Any] = {
         "A": given.J[:, :, :X],
         "B": given.J[:, :, X:],
         "G": given.G,
@@ -88,12 +107,16 @@ def _pass(steps: Steps, given: Recursion, regularization: float, *, second: bool
         "Gu": given.Gz[..., X:],
         "gradient": given.gradient,
         "hessian": given.hessian,
+        "feedforward": feedforward,
+        "feedback": gains,
+        "control_gradient": by_controls,
+        "spread": spread,
+        "factors": factors,
     }
-    found_arrays = {"feedforward": feedforward, "feedback": gains, "control_gradient": by_controls}
-    arrays: dict[str, Any] = {**given_arrays, **found_arrays, "spread": spread, "factors": factors}
     found: core.BackwardPass | RootPass
     if roots:
-        final, running = squares_of(end.cost.gradient, end.cost.hessian), squares_of(given.gradient, given.hessian)
+        final = squares_of(end.cost.gradient, end.cost.hessian)
+        running = squares_of(given.gradient, given.hessian)
         if final is None or running is None:
             return None
         found = RootPass(m, final.after(end.slopes).padded(X), gradient)
@@ -117,15 +140,17 @@ def foreseen(steps: Steps, plan: Plan) -> tuple[Floats, bool]:
     Also whether a control reaches a limit.
     """
     problem, given = steps.problem, steps.recursion(None, None)
-    (S, X, _), layout = given.J.shape, Layout.of(problem)
+    (S, X, _), layout = given.J.shape, steps.layout
     R, m = plan.feedforward.shape
-    slack = steps.slack if problem.limited else np.zeros((0, 2, m))
+    slack = np.zeros((0, 2, m))
+    if problem.limited:
+        slack = problem.control_limits - problem.decided(steps.trajectory)[:, None]
     moves, after = np.empty((R, m)), np.empty((S, X))
     limited = core.foresee(
         problem.hold, given.J[:, :, :X], given.J[:, :, X:], plan.feedforward, plan.gains, slack, moves, after
     )
-    x = np.vstack([np.zeros((1, layout.states)), after[:, : layout.states]])
-    return layout.joined(x[-layout.stages - 1 :], moves), limited
+    x = np.vstack([np.zeros((1, plan.states)), after[:, : plan.states]])
+    return layout.joined(x[-problem.steps - 1 :], moves), limited
 
 
 def noise_shares(problem: OptimalControlProblem, motion: Trajectory, plan: Plan) -> Floats:

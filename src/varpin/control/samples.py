@@ -18,35 +18,27 @@ from varpin.trajectory import Trajectory
 _TERMS, _SHORT = 11, 0.125
 
 
-def at_samples(rule: Floats, J: Floats, velocity: Floats | None) -> Floats:
+def at_samples(rule: Floats, J: Floats, velocity: Floats) -> Floats:
     """Derivatives (N, s, 2n, Z) of (q, v) at each sample of N steps, from those J (N, 2n, Z) of the state after them.
 
-    The variables begin with the state before the step. ``velocity`` is dv/dx (N + 1, n, 2n) at nodes, None where x
-    holds v.
+    The variables begin with the state before the step. ``velocity`` is dv/dx (N + 1, n, 2n) at nodes.
     """
     N, x, Z = J.shape
     n = x // 2
     nodes = np.zeros((N, 4, n, Z))
     nodes[:, 0, :, :n] = np.eye(n)
-    if velocity is None:
-        nodes[:, 1, :, n:x] = np.eye(n)
-        nodes[:, 3] = J[:, n:]
-    else:
-        nodes[:, 1, :, :x] = velocity[:-1]
-        nodes[:, 3] = velocity[1:] @ J
+    nodes[:, 1, :, :x] = velocity[:-1]
     nodes[:, 2] = J[:, :n]
+    nodes[:, 3] = velocity[1:] @ J
     found: Floats = rule[:, 1:].reshape(-1, 4) @ nodes.reshape(N, 4, n * Z)
     return found.reshape(N, len(rule), x, Z)
 
 
-def after_impulse(rule: Floats, hessian: Floats, velocity: Floats | None, dt: float) -> Floats:
+def after_impulse(rule: Floats, hessian: Floats, velocity: Floats, dt: float) -> Floats:
     """Hessian (N, 2n, 2n) of each step's running cost in the state after its noise impulse.
 
-    Args:
-        rule: The sampling rule.
-        hessian: Hessians (N, s, 2n, 2n) of the cost in (q, v) at the samples.
-        velocity: As for :func:`at_samples`.
-        dt: The time step [s].
+    ``hessian`` (N, s, 2n, 2n) are those of the cost in (q, v) at the samples, ``velocity`` is as for
+    :func:`at_samples`.
     """
     N, x = len(hessian), hessian.shape[-1]
     late = rule.copy()
@@ -57,7 +49,12 @@ def after_impulse(rule: Floats, hessian: Floats, velocity: Floats | None, dt: fl
 
 
 def beyond_samples(
-    problem: OptimalControlProblem, motion: Trajectory, lin: Linearization, hessian: Floats, velocity: Floats
+    problem: OptimalControlProblem,
+    motion: Trajectory,
+    lin: Linearization,
+    hessian: Floats,
+    velocity: Floats,
+    terminal: Floats,
 ) -> Floats | None:
     """The Hessian (N, 2n, 2n), in the noise's jump of the state after a step, of what velocities cost within the step.
 
@@ -69,18 +66,14 @@ def beyond_samples(
     step, by :func:`_left_at_end`. None where there is nothing to add: without noise or costs of velocities, for
     impulses, for sums over nodes (``sampling="start"``), and under constraints of the scene.
 
-    Args:
-        problem: The problem.
-        motion: The motion.
-        lin: Its linearized steps.
-        hessian: Hessians (N, s, 2n, 2n) of the running cost in (q, v) at the samples.
-        velocity: dv/dx (N + 1, n, 2n) at the nodes, in momenta.
+    ``hessian`` (N, s, 2n, 2n) are those of the running cost in (q, v) at the samples, ``terminal`` (2n, 2n) that of the
+    terminal cost. ``velocity`` is dv/dx (N + 1, n, 2n) at the nodes, in momenta.
 
     Raises:
         LinearizationError: Velocities grow without bound within a step.
     """
     n, h = problem.scene.robot.dof, problem.dt
-    end = problem.expand_terminal(motion).hessian[0, n : 2 * n, n : 2 * n]
+    end = terminal[n:, n:]
     of_speeds = np.zeros(hessian.shape)
     of_speeds[..., n:, n:] = hessian[..., n:, n:]
     held = problem.integrator.holds_noise and problem.sampling != "start" and not problem.scene.constraints
@@ -89,7 +82,12 @@ def beyond_samples(
     found = -after_impulse(problem.rule, of_speeds, velocity, h)
     by_momenta, to_impulse = velocity[:, :, n:], np.linalg.pinv(lin.J[:, n:])
     whole = np.einsum("s,Nsab->Nab", h * problem.rule[:, 0], hessian[..., n:, n:])
-    begin, after = (D @ M for D, M in zip(_damping(problem, motion), (by_momenta[:-1], by_momenta[1:]), strict=True))
+    # The damping where steps begin and where they end; friction that falls with velocity is left out.
+    forces = motion.u @ problem.scene.actuation.T
+    begin, after = (
+        damping_matrices(problem.scene, motion.q[part], motion.v[part], forces, custom=True) @ by_momenta[part]
+        for part in (slice(None, -1), slice(1, None))
+    )
     decay = 0.5 * h * (begin + after)
     # A step in which velocities grow without bound, as in a trial that runs away, has no mean.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -101,16 +99,6 @@ def beyond_samples(
         step = int(lost.argmax())
         raise LinearizationError(step, step * h, "what noise adds to velocities grows without bound within the step")
     return found
-
-
-def _damping(problem: OptimalControlProblem, motion: Trajectory) -> tuple[Floats, Floats]:
-    """The damping (N, n, n) where steps begin and where they end: friction that falls with velocity is left out."""
-    scene, forces = problem.scene, motion.u @ problem.scene.actuation.T
-    begin, end = (
-        damping_matrices(scene, motion.q[part], motion.v[part], forces, custom=True)
-        for part in (slice(None, -1), slice(1, None))
-    )
-    return begin, end
 
 
 def _left_at_end(problem: OptimalControlProblem, Z: Floats, P: Floats) -> Floats:

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -28,11 +28,10 @@ from varpin.control.multipliers import Multipliers, flat, split
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.qp import Minimum, Program, changes
 from varpin.control.riccati import Plan, backward, foreseen, noise_shares
-from varpin.control.rollout import around
 from varpin.control.second_order import curvature_along
 from varpin.control.sizes import FEASIBLE, HARMLESS, NOTABLE, ROUNDING, SLIGHT, TRACE
 from varpin.control.solution import Solution
-from varpin.control.stages import Layout, Rows, Stages, Steps, states
+from varpin.control.stages import Cost, Rows, Steps, change, states
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError, StepError
 from varpin.integrators import Integrator
@@ -62,6 +61,10 @@ _ABOVE, _HEAVY = 1.5, 10.0
 _HALVINGS = 5
 
 
+# What a search keeps in its :class:`SearchState`, and what its margins do.
+_KEPT, _OF_MARGINS = ("weight", "regularization", "growth", "first", "second_order"), ("counts", "since", "rounds")
+
+
 class Step(NamedTuple):
     """What a quadratic program or a backward pass gives."""
 
@@ -72,15 +75,17 @@ class Step(NamedTuple):
     minimum: Minimum | None = None  # of the program; None without limits and rows in reach
     elastic: bool = False  # whether rows may be missed
 
+    @classmethod
+    def of(cls, plan: Plan) -> Step:
+        """That of a backward pass."""
+        return cls(plan.feedforward, plan.gradient, plan.slope, plan.expected_decrease)
+
 
 class Search:
     """The state of a search: the motion, its multipliers and the history.
 
-    Args:
-        problem: The problem.
-        second_order: Whether second derivatives of the steps count where the model stays convex.
-        regularization: The first one, relative to the diagonal of Quu.
-        tick: Whether it is a controller's: margins stay, and there are rows in the middles of steps alone.
+    Options are those of :func:`varpin.solve`. In a controller's ``tick`` margins stay, and there are rows in the
+    middles of steps alone.
     """
 
     def __init__(
@@ -99,13 +104,14 @@ class Search:
         self.tightening = Tightening(problem)
         self.history: list[Iteration] = []
         self.cost = np.inf
-        self.reason, self.deadline = "", np.inf
+        self.reason = ""
         self.state: SearchState | None = None
-        self.plan: Plan | None = None
-        self.noise: Plan | None = None  # the pass whose value function tells what noise costs
-        self.step: Step | None = None
+        self.plan = Plan.none(problem)
+        self.noise = self.plan  # the pass whose value function tells what noise costs
+        self.step = Step.of(self.plan)
         self.exact = self.unsolved = False
-        self.stages: Stages | None = None
+        self.quadratic: list[Cost] = []
+        self._values: list[Floats] = []  # of all rows, margins included, in tenths of ranges
         self._passes = 0  # backward passes since the last entry of the history
         robot = problem.scene.robot.name
         self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {problem.t0:g} s"
@@ -130,13 +136,13 @@ class Search:
 
     def resume(self, plan: Solution) -> None:
         """Continue from the state of a plan."""
-        state, known = plan.search, plan.multipliers
+        state, known, second_order = plan.search, plan.multipliers, self.second_order
         assert state is not None
         self._move(plan.trajectory, self.problem.shares(plan.trajectory))
-        self.weight, self.first, margins = state.weight, state.first, self.tightening
-        margins.counts, margins.since, margins.rounds = state.counts, state.since, state.rounds
-        self.regularization, self.growth = state.regularization, state.growth
-        self.second_order = self.second_order or state.second_order
+        for owner, names in ((self, _KEPT), (self.tightening, _OF_MARGINS)):
+            for name in names:
+                setattr(owner, name, getattr(state, name))
+        self.second_order |= second_order
         self.history = list(plan.history[: state.iterations])
         if known is not None:
             self.take(known)
@@ -150,9 +156,11 @@ class Search:
 
     def run(self, tolerance: float, max_iterations: int, deadline: float, report: Report) -> Status:
         """Iterate to the end."""
-        last, longest, self.deadline = len(self.history) + max_iterations, 0.0, deadline
+        last, longest = len(self.history) + max_iterations, 0.0
         while True:
-            self.state = self._state()
+            own: dict[str, Any] = {name: getattr(self, name) for name in _KEPT}
+            margins = {name: getattr(self.tightening, name) for name in _OF_MARGINS}
+            self.state = SearchState(**own, **margins, iterations=len(self.history))
             started = time.perf_counter()
             try:
                 while not self._made():
@@ -168,7 +176,7 @@ class Search:
                 logger.warning("%s: %s", self.label, error)
                 self.reason = str(error)
                 return Status.NOT_DIFFERENTIABLE
-            close = ended is None and self._known.decrease <= SLIGHT * stake.moved
+            close = ended is None and self.step.decrease <= SLIGHT * stake.moved
             if (close or ended in (Status.CONVERGED, Status.INFEASIBLE)) and self._goes_on(ended):
                 continue
             ended = ended or self._out_of(last, deadline)
@@ -177,7 +185,7 @@ class Search:
                 self._note(report, started)
                 self.reason = self.reason or self._numbers(tolerance)
                 return ended
-            step = self._known
+            step = self.step
             taken = self._line_search()
             self._note(report, started, taken)
             longest = max(longest, time.perf_counter() - started)
@@ -226,11 +234,6 @@ class Search:
         """Sum of all violations, in tenths of ranges."""
         return float(sum(part.sum() for part in self._excess))
 
-    @property
-    def _known(self) -> Step:
-        assert self.step is not None
-        return self.step
-
     def _move(self, motion: Trajectory, shares: Floats) -> None:
         self.trajectory, self.shares, self.cost = motion, shares, float(shares.sum())
         self.along = Steps(self.problem, motion)
@@ -241,19 +244,6 @@ class Search:
         self.multipliers = [np.zeros(item.shape) for item in self.bound]
         self.tightening.enforce(self.bound, between)
         self._excess: list[Floats] = [np.zeros(item.size) for item in self.bound]  # in tenths of ranges
-
-    def _state(self) -> SearchState:
-        return SearchState(
-            weight=self.weight,
-            regularization=self.regularization,
-            growth=self.growth,
-            first=self.first,
-            counts=self.tightening.counts,
-            since=self.tightening.since,
-            rounds=self.tightening.rounds,
-            second_order=self.second_order,
-            iterations=len(self.history),
-        )
 
     def _made(self) -> bool:
         """Make feedback, rows and the step of the motion with the present regularization; whether there is one."""
@@ -278,20 +268,19 @@ class Search:
             self.noise = self._pass(0.0) or plan
         if self._has_goals:
             self.plan = self._pass_to_goals() or plan
-        elastic = self.step is not None and self.step.elastic
-        self.tightening.follow(along, self.plan, len(self.history), grow=not elastic)
+        self.tightening.follow(along, self.plan, len(self.history), grow=not self.step.elastic)
         # The step is the pass's own, where that keeps to all limits and rows.
         plain = self.regularization == 0.0 and not self._has_goals
         free = not self.bound and (not problem.limited or self._is_free(plan, ()))
         if not free:
-            self.stages = Stages.along(along, self.noise.spread if problem.scene.processes else None, curvature)
-            given = zip(self.bound, self.tightening.margins, strict=True)
-            self.rows = [self.stages.rows(*pair) for pair in given]
-            self._excess = [_excess(row.values, equality=row.equality) for row in self.rows]
+            self.quadratic = along.quadratic(self.noise.spread if problem.scene.processes else None, curvature)
+            self.rows = [along.rows(item) for item in self.bound]
+            self._values = self._values_of(self.trajectory)
+            self._excess = self._excess_of(self._values)
             free = bool(self.bound) and plain and self._is_free(plan, self.rows)
         if not free:
             return self._solve(plan)
-        self.step = Step(plan.feedforward, plan.gradient, plan.slope, plan.expected_decrease)
+        self.step = Step.of(plan)
         self.multipliers = [np.zeros(item.shape) for item in self.bound]
         return True
 
@@ -302,29 +291,21 @@ class Search:
         exists = smooth and self.problem.integrator.variational and not self.tick
         return exists and saturates(scene, self.trajectory)
 
-    def _pass(
-        self,
-        regularization: float,
-        curvature: Floats | None = None,
-        *,
-        steps: Steps | None = None,
-        fixed: Mask | None = None,
-    ) -> Plan | None:
+    def _pass(self, regularization: float, curvature: Floats | None = None, fixed: Mask | None = None) -> Plan | None:
         """A backward pass of the costs, in which some controls (R, m) may stay as they are."""
         self._passes += 1
-        return backward(steps or self.along, regularization, curvature=curvature, fixed=fixed)
+        return backward(self.along, regularization, curvature=curvature, fixed=fixed)
 
     def _solve(self, plan: Plan) -> bool:
         """Make the step by a quadratic program within limits and rows; whether it has a solution."""
-        problem, stages, rows = self.problem, self.stages, self.rows
-        assert stages is not None
+        problem, along, rows = self.problem, self.along, self.rows
         u, (lower, upper) = problem.decided(self.trajectory), problem.control_limits
         least, most = np.minimum(lower - u, 0.0), np.maximum(upper - u, 0.0)
         if problem.begin is not None:
             least[0], most[0] = (np.where(np.isnan(problem.begin), part[0], 0.0) for part in (least, most))
-        program = Program(stages, rows, (least, most), plan, self.regularization if rows else 0.0)
+        program = Program(along, rows, (least, most), plan, self.regularization if rows else 0.0)
         self.program = program
-        values, bad = [row.values for row in rows], self._badness
+        values, bad = self._values, self._badness
         found = program.minimum(values)
         needed = np.inf if found is None else _ABOVE * _largest(found.multipliers)
         # Rows that cost far more than what is at stake are approached step by step.
@@ -345,9 +326,9 @@ class Search:
             (np.where(np.abs(part) > TRACE * largest, part, 0.0) / item.scale).reshape(item.shape)
             for part, item in zip(found.multipliers, self.bound, strict=True)
         ]
-        linear, whole = stages.change(found.z)
+        linear, whole = change(self.quadratic, found.z)
         removed = self.weight * (bad - found.slack)
-        gradient = stages.slopes(rows, found.multipliers)
+        gradient = along.lagrangian(self.quadratic, rows, found.multipliers)[along.layout.control[:-1]]
         self.step = Step(self._feedforward(found.z), gradient, linear - removed, removed - whole, found, elastic)
         return True
 
@@ -364,30 +345,29 @@ class Search:
                 J = item.jacobian(self.trajectory.q, self.trajectory.v)[-1] @ end.slopes / item.scale
                 hessian += max(abs(self.cost), self.first) * J.T @ J
         vars(made)["terminal"] = end._replace(hessian=hessian)
-        return self._pass(0.0, steps=made)
+        self._passes += 1
+        return backward(made, 0.0)
 
     def _is_free(self, plan: Plan, rows: Sequence[Rows]) -> bool:
         """Whether the full step of a backward pass keeps to all limits and rows, by the linear model."""
         z, limited = foreseen(self.along, plan)
-        met = ((row.values + change <= 0.0).all() for row, change in zip(rows, changes(rows, z), strict=True))
-        return not limited and all(met)
+        moves = zip(self._values, changes(rows, z), strict=True)
+        return not limited and all((c + move <= 0.0).all() for c, move in moves)
 
     def _feedforward(self, z: Floats) -> Floats:
         """The changes of the controls in z, without what feedback gives for its states."""
-        plan, stages = self.plan, self.stages
-        assert plan is not None
-        assert stages is not None
-        at, beside = stages.layout.decisions(plan.feedback, plan.previous)
-        return (beside @ np.where(at >= 0, z[at], 0.0)[:, :, None])[:, :, 0]
+        changes = self.plan.beside @ np.append(z, 0.0)[self.along.layout.decision][:, :, None]
+        feedforward: Floats = changes[:, :, 0]
+        return feedforward
 
     def _costates(self) -> Floats:
         """Derivatives (N, 2n) of the Lagrangian in the state after each step, with the known multipliers."""
-        stages, rows, pushes = Stages.along(self.along), [], []
-        for item, margin, push in zip(self.bound, self.tightening.margins, self.multipliers, strict=True):
+        along, rows, pushes = self.along, [], []
+        for item, push in zip(self.bound, self.multipliers, strict=True):
             if push.any() and not item.of_controls:
-                rows.append(stages.rows(item, margin))
+                rows.append(along.rows(item))
                 pushes.append(push.ravel() * item.scale)
-        return stages.costates(rows, pushes)
+        return along.lagrangian(along.quadratic(), rows, pushes)[along.layout.state[1:]]
 
     def _ended(self, tolerance: float) -> Status | None:
         """The status of a search whose step gains no more than the tolerance; None if it goes on."""
@@ -409,7 +389,7 @@ class Search:
         return found
 
     def _verdict(self, tolerance: float) -> Status | None:
-        step, share, bad = self._known, self._share(tolerance), self._badness
+        step, share, bad = self.step, self._share(tolerance), self._badness
         if self.violation > FEASIBLE:
             # By the program, or by what the search has done.
             dear, merits = self.weight * bad, self._merits()
@@ -435,7 +415,6 @@ class Search:
         past = self.history[self.tightening.since :]
         costs = [item.cost for item in past[:-1]]
         then = [(item.noise_cost, item.violation) for item in past[1:]]
-        assert self.noise is not None
         here = self.cost + self.noise.noise + self.weight * self._badness
         return [cost + noise + self.weight * bad for cost, (noise, bad) in zip(costs, then, strict=True)] + [here]
 
@@ -459,7 +438,6 @@ class Search:
         if self.tick:
             return False
         plan, margins, iteration = self.plan, self.tightening, len(self.history)
-        assert plan is not None
         # What cannot be met is violent, and does not widen margins.
         grow = ended is not Status.INFEASIBLE
         if ended is not None and margins.settle(self.along, plan, iteration, grow=grow):
@@ -480,8 +458,7 @@ class Search:
 
     def _line_search(self) -> Taken:
         """Move to the trial along the step whose merit, (O11), a line search accepts, if any."""
-        step, noise, problem, motion = self._known, self.noise, self.problem, self.trajectory
-        assert noise is not None
+        step, noise, problem, motion = self.step, self.noise, self.problem, self.trajectory
         z = None if step.minimum is None else step.minimum.z
         shares, bad = noise_shares(problem, motion, noise), self._badness
         integrator = self._in_bounds(motion)
@@ -497,7 +474,8 @@ class Search:
                 if problem.scene.processes:
                     merit += float((noise_shares(problem, moved, noise) - shares).sum())
                 if self.bound:
-                    merit += self.weight * (sum(float(part.sum()) for part in self._violations(moved)) - bad)
+                    excess = self._excess_of(self._values_of(moved))
+                    merit += self.weight * (sum(float(part.sum()) for part in excess) - bad)
             except TRIAL_ERRORS as error:
                 logger.info("%s: trial: %s", self.label, error)
                 return Trial()
@@ -515,39 +493,43 @@ class Search:
     def _in_bounds(self, motion: Trajectory) -> Integrator:
         """The integrator of trials, whose steps may not be halved much more often than those of a motion."""
         integrator: Any = self.problem.integrator
-        if getattr(integrator, "guard", None) is None:
-            return self.problem.integrator
-        halvings = int(motion.statistics.halvings.max(initial=0)) + _HALVINGS
-        guard = replace(integrator.guard, max_halvings=min(integrator.guard.max_halvings, halvings))
-        bounded: Integrator = replace(integrator, guard=guard)
-        return bounded
+        if getattr(integrator, "guard", None) is not None:
+            halvings = int(motion.statistics.halvings.max(initial=0)) + _HALVINGS
+            guard = replace(integrator.guard, max_halvings=min(integrator.guard.max_halvings, halvings))
+            integrator = replace(integrator, guard=guard)
+        return cast(Integrator, integrator)
 
     def _along_step(self, length: float, feedforward: Floats, z: Floats | None) -> Commands:
         """Commands of a length along a step with changes z, whose controls that it brings to a limit stay there."""
         problem, plan = self.problem, self.plan
-        assert plan is not None
         now = problem.decided(self.trajectory)
         u, gains, previous = now + length * feedforward, plan.feedback, plan.previous
         if z is not None and problem.limited:
-            aim = now + length * Layout.of(problem).controls_of(z)
+            aim = now + length * z[self.along.layout.control[:-1]]
             for limit, sign in zip(problem.control_limits, (-1.0, 1.0), strict=True):
                 there = np.isfinite(limit) & (sign * (aim - limit) >= -TRACE * np.abs(limit))
                 u, gains = np.where(there, limit, u), np.where(there[:, :, None], 0.0, gains)
                 previous = None if previous is None else np.where(there[:, :, None], 0.0, previous)
-        x = states(problem, self.trajectory)[: -1 : problem.hold]
-        commands = around(problem, now, x, gains, previous)._replace(u=u)
-        if problem.linear:
-            # The first control has no feedback: its state is given.
-            first = problem.begun(np.clip(u[:1], *problem.control_limits))
-            commands = commands._replace(u=u[1:], before=first)
-        return commands
+        x, before = states(problem, self.trajectory)[: -1 : problem.hold], np.zeros((0, len(now[0])))
+        if previous is not None:
+            # The control before the first one is given.
+            x = np.hstack([x, now[:-1] if problem.linear else np.vstack([now[:1], now[:-1]])])
+            gains = np.concatenate([gains, previous], axis=2)
+        commands = Commands(u, gains, x, problem.hold, problem.control_limits, before)
+        if not problem.linear:
+            return commands
+        # The first control has no feedback: its state is given.
+        first = problem.begun(np.clip(u[:1], *problem.control_limits))
+        times = np.array(problem.integrator.stage_times or (0.5,))
+        return commands._replace(u=u[1:], gains=gains[1:], before=first, stage_times=times)
 
-    def _violations(self, motion: Trajectory) -> list[Floats]:
-        """Violations (P,) of all rows on a motion, margins included, in tenths of ranges."""
-        values = zip(self._values(motion), self.bound, strict=True)
-        return [_excess(part, equality=item.source.equality) for part, item in values]
+    def _excess_of(self, values: Sequence[Floats]) -> list[Floats]:
+        """Violations (P,) by values of all rows."""
+        pairs = zip(values, self.bound, strict=True)
+        return [np.abs(c) if item.source.equality else np.maximum(c, 0.0) for c, item in pairs]
 
-    def _values(self, motion: Trajectory) -> list[Floats]:
+    def _values_of(self, motion: Trajectory) -> list[Floats]:
+        """Values (P,) of all rows on a motion, margins included, in tenths of ranges."""
         u = self.problem.control_rows(motion)
         return [
             (item.value(motion.q, motion.v, u) + margin).ravel() / item.scale
@@ -556,13 +538,13 @@ class Search:
 
     def _corrected(self, motion: Trajectory) -> Floats | None:
         """The changes with rows and dynamics as a full step found them; None where there are none."""
-        problem, step, stages = self.problem, self._known, self.stages
-        if step.minimum is None or stages is None or not self.bound:
+        problem, step, along = self.problem, self.step, self.along
+        if step.minimum is None or not self.bound:
             return None
         moved = states(problem, motion) - states(problem, self.trajectory)
-        z = stages.layout.joined(moved, problem.decided(motion) - problem.decided(self.trajectory))
-        values = [there - change for there, change in zip(self._values(motion), changes(self.rows, z), strict=True)]
-        found = self.program.minimum(values, stages.gaps_of(z), self.weight if step.elastic else None)
+        z = along.layout.joined(moved, problem.decided(motion) - problem.decided(self.trajectory))
+        values = [there - change for there, change in zip(self._values_of(motion), changes(self.rows, z), strict=True)]
+        found = self.program.minimum(values, along.gaps_of(z), self.weight if step.elastic else None)
         return None if found is None else found.z
 
     def _share(self, tolerance: float) -> float:
@@ -570,7 +552,7 @@ class Search:
         return tolerance * (self.along.stake.moved + HARMLESS * self.first)
 
     def _expected(self) -> str:
-        return f"the expected decrease is {self._known.decrease:.1e}"
+        return f"the expected decrease is {self.step.decrease:.1e}"
 
     def _numbers(self, tolerance: float) -> str:
         share = self._share(tolerance)
@@ -593,17 +575,16 @@ class Search:
         return Status.INFEASIBLE
 
     def _note(self, report: Report, started: float, taken: Taken | None = None) -> None:
-        step, noise = self._known, self.noise
         item = Iteration(
             index=len(self.history),
             cost=self.cost,
-            noise_cost=0.0 if noise is None else noise.noise,
+            noise_cost=self.noise.noise,
             violation=self._badness,
-            expected_decrease=step.decrease,
+            expected_decrease=self.step.decrease,
             decrease=0.0 if taken is None or taken.length == 0.0 else -taken.best.merit,
             step=0.0 if taken is None else taken.length,
             regularization=self.regularization,
-            gradient=float(np.abs(step.gradient).max()),
+            gradient=float(np.abs(self.step.gradient).max()),
             backward_passes=self._passes,
             rollouts=0 if taken is None else taken.trials,
             seconds=time.perf_counter() - started,
@@ -636,11 +617,7 @@ class Search:
 
     def solution(self, status: Status) -> Solution:
         """The motion, however the search ended, with the feedback around it."""
-        problem, plan, step = self.problem, self.plan, self.step
-        R, m, n = problem.decisions, problem.scene.controls, problem.scene.robot.dof
-        previous = None
-        if problem.rate is not None or problem.linear:
-            previous = np.zeros((R, m, m)) if plan is None or plan.previous is None else plan.previous
+        problem, plan = self.problem, self.plan
         known = None
         if problem.constraints:
             known = Multipliers(
@@ -650,20 +627,19 @@ class Search:
                 added=None if self.tightening.added is None else flat(self.tightening.added),
             )
         reason = self.reason
-        if plan is not None and plan.loss > HARMLESS:
+        if plan.loss > HARMLESS:
             lost = f"rounding may have changed Quu by {plan.loss:.0e} of itself: weights or inertias are too far apart"
             logger.warning("%s: the gains cannot be trusted: %s", self.label, lost)
             reason = f"{reason}; {lost}"
-        known_noise = np.nan if problem.scene.processes else 0.0
         return Solution(
             problem=problem,
             trajectory=self.trajectory,
-            gains=np.zeros((R, m, 2 * n)) if plan is None else plan.feedback,
-            previous_gains=previous,
-            feedforward=np.zeros((R, m)) if step is None else step.feedforward,
-            gradient=np.full((R, m), np.nan) if step is None else step.gradient,
+            gains=plan.feedback,
+            previous_gains=plan.previous,
+            feedforward=self.step.feedforward,
+            gradient=self.step.gradient,
             cost=self.cost,
-            noise_cost=known_noise if self.noise is None else self.noise.noise,
+            noise_cost=self.noise.noise,
             status=status,
             reason=reason,
             history=tuple(self.history),
@@ -674,7 +650,3 @@ class Search:
 
 def _largest(multipliers: Sequence[Floats]) -> float:
     return max((float(np.abs(part).max(initial=0.0)) for part in multipliers), default=0.0)
-
-
-def _excess(values: Floats, *, equality: bool) -> Floats:
-    return np.abs(values) if equality else np.maximum(values, 0.0)

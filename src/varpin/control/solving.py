@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +19,6 @@ from varpin.control.checks import foreseen, looked_at
 from varpin.control.history import Iteration, Status
 from varpin.control.problem import FASTEST, OptimalControlProblem, require_problem
 from varpin.control.refine import refine
-from varpin.control.rollout import around, controls_along, first_commands
 from varpin.control.search import Report, Search
 from varpin.control.sizes import FEASIBLE, NOTABLE, SLIGHT, TRACE
 from varpin.control.solution import Solution
@@ -29,12 +28,21 @@ from varpin.finding import announce
 from varpin.linearization import node_jets
 from varpin.mechanics.forces import of_kind
 from varpin.model import degrees_hint
-from varpin.signals.commands import as_moved, with_ends
+from varpin.signals.commands import as_moved, open_line, open_loop, with_ends
 from varpin.signals.policy import LinearPolicy
 from varpin.simulation.choice import STIFF
-from varpin.simulation.record import rollout
 from varpin.simulation.spectrum import masses
-from varpin.support.checks import JointValues, count, finite_array, flag, positive, real, told_motion
+from varpin.support.checks import (
+    JointValues,
+    as_floats,
+    control_array,
+    count,
+    finite_array,
+    flag,
+    positive,
+    real,
+    told_motion,
+)
 from varpin.support.one_thread import one_thread
 from varpin.trajectory import Trajectory
 
@@ -147,7 +155,12 @@ def solve(
         for name, given in (("controls", controls), ("states", states), ("true_cost", true_cost)):
             if given is not None:
                 raise InputError(f"resume goes on with the solution's own search: leave out either {name} or resume")
-        _require_resumable(problem, resume)
+        if not isinstance(resume, Solution):
+            raise InputError(f"resume must be a Solution, got {type(resume).__name__}")
+        if resume.search is None:
+            raise InputError("resume: the solution does not hold the state of its search; give it as controls")
+        if other := problem.mismatch(resume.problem.setting, resume.trajectory, resume.cost):
+            raise InputError(f"resume: the solution is {other}; give it as controls")
     path = None if states is None else _path_of(problem, states)
     if check:
         # The search may take long where values are in wrong units.
@@ -165,7 +178,7 @@ def solve(
         if resume is not None:
             search.resume(resume)
         elif path is not None:
-            search.begin(_commands_along(problem, path, controls_along(problem, controls)))
+            search.begin(first_commands(problem, _policy_along(problem, path, controls)))
         elif controls is not None:
             search.begin(first_commands(problem, controls))
         else:
@@ -226,7 +239,7 @@ def _led_to(problem: OptimalControlProblem, tolerance: float, most: int, deadlin
             search = Search(easier)
             search.begin(commands)
             plan = searched(search, max(tolerance, SLIGHT), most, deadline, lambda *_: None)
-            commands = _commands_along(harder, (plan.trajectory.q, plan.trajectory.v), None)
+            commands = first_commands(harder, _policy_along(harder, (plan.trajectory.q, plan.trajectory.v), None))
         except VarpinError as error:
             logger.info("%s: under wider dry friction: %s", problem.scene.robot.name, error)
             continue
@@ -260,16 +273,6 @@ def _gentler(problem: OptimalControlProblem) -> list[OptimalControlProblem]:
     return [widened(_SHARPENED**k) for k in range(count, 0, -1)]
 
 
-def _require_resumable(problem: OptimalControlProblem, resume: Solution) -> None:
-    """Raise an InputError unless ``resume`` is a solution of the problem with the state of its search."""
-    if not isinstance(resume, Solution):
-        raise InputError(f"resume must be a Solution, got {type(resume).__name__}")
-    if resume.search is None:
-        raise InputError("resume: the solution does not hold the state of its search; give it as controls")
-    if other := problem.mismatch(resume.problem.setting, resume.trajectory, resume.cost):
-        raise InputError(f"resume: the solution is {other}; give it as controls")
-
-
 def _path_of(problem: OptimalControlProblem, given: Any) -> _Path:
     """The states that a search starts from, checked."""
     robot, shape = problem.scene.robot, (problem.steps + 1, problem.scene.robot.dof)
@@ -299,48 +302,83 @@ def _path_of(problem: OptimalControlProblem, given: Any) -> _Path:
     return positions, speeds
 
 
-def _commands_along(problem: OptimalControlProblem, path: _Path, controls: Floats | None) -> Commands:
-    """Commands whose motion keeps to states, under ``controls`` (R, m) or, by default, those of inverse dynamics."""
-    scene, hold, (q, v), u = problem.scene, problem.hold, path, controls
-    m = scene.controls
-    if u is None:
-        torques = _joint_forces(problem, q, v) @ np.linalg.pinv(scene.actuation).T
-        u = as_moved(scene, q[hold::hold], v[hold::hold], torques)
-        u = np.clip(u, *problem.control_limits)
+def _policy_along(problem: OptimalControlProblem, path: _Path, controls: object) -> LinearPolicy:
+    """The policy whose motion keeps to states, under ``controls`` or, by default, those of inverse dynamics."""
+    if isinstance(controls, Solution | LinearPolicy):
+        raise InputError("controls beside states must be (R, m), (m,) or by joint name, without feedback")
+    scene, hold, (q, v) = problem.scene, problem.hold, path
+    if controls is None:
+        at, rate = 0.5 * (q[:-1:hold] + q[hold::hold]), np.diff(q[::hold], axis=0) / problem.period
+        # What servos add to the command that their springs need to hold their positions.
+        still = at @ scene.holding.T @ scene.actuation.T
+        forces = core.inverse_dynamics(scene.core, at, rate, np.diff(v[::hold], axis=0) / problem.period)
+        forces -= scene.core.forces(at, rate, still)[0]
+        u = as_moved(scene, q[hold::hold], v[hold::hold], forces @ np.linalg.pinv(scene.actuation).T)
+    else:
+        u = _rows_of(problem, controls)
+    u = np.clip(u, *problem.control_limits)
     q, v = q[:-1:hold], v[:-1:hold]
-    if problem.integrator.variational:
+    on: Literal["momentum", "velocity"] = "momentum" if problem.integrator.variational else "velocity"
+    if on == "momentum":
         v = (node_jets(scene, q, v)[0] @ v[:, :, None])[:, :, 0]
-    x, gains = np.hstack([q, v]), problem.feedback(FASTEST / problem.period)
+    gains = np.tile(problem.feedback(FASTEST / problem.period), (len(q), 1, 1))
     if not problem.linear:
-        return around(problem, u, x, np.tile(gains, (len(u), 1, 1)), None)
+        return problem.policy_of(u, gains, np.hstack([q, v]), on)
     if controls is None:
         # Lines through the means of neighbours.
         held, u = u, np.vstack([u[:1], 0.5 * (u[:-1] + u[1:]), u[-1:]])
         u[1:] = with_ends(scene, u[1:], held)
     u = problem.begun(u)
     # A line answers a state half a step later than a held control, so that feedback may do harm.
-    tries = [
-        around(problem, u, x, np.tile(own, (len(u), 1, 1)), np.zeros((len(u), m, m))) for own in (gains, 0 * gains)
-    ]
-    return min(tries, key=lambda commands: _cost_under(problem, commands))
+    tries = [problem.policy_of(u[1:], own, np.hstack([q, v]), on, before=u[0]) for own in (gains, 0.0 * gains)]
+    return min(tries, key=lambda policy: _cost_under(problem, policy))
 
 
-def _cost_under(problem: OptimalControlProblem, commands: Commands) -> float:
-    """The cost of the motion under commands; infinite where it fails."""
+def _cost_under(problem: OptimalControlProblem, policy: LinearPolicy) -> float:
+    """The cost of the motion under a policy; infinite where it fails."""
     try:
-        motion, failure = rollout(problem.scene, problem.integrator, problem.q0, problem.v0, commands, problem.dt)
-        return problem.cost_of(motion) if failure is None else np.inf
+        return problem.cost_of(problem.simulate(policy))
     except VarpinError:
         return np.inf
 
 
-def _joint_forces(problem: OptimalControlProblem, q: Floats, v: Floats) -> Floats:
-    """The joint forces (R, n) that controls have to give over each decision, on q and v (N + 1, n)."""
-    scene, period = problem.scene, problem.period
-    q, v = q[:: problem.hold], v[:: problem.hold]
-    at = 0.5 * (q[:-1] + q[1:])
-    rate, acceleration = np.diff(q, axis=0) / period, np.diff(v, axis=0) / period
-    # What servos add to the command that their springs need to hold their positions.
-    still = at @ scene.holding.T @ scene.actuation.T
-    found: Floats = core.inverse_dynamics(scene.core, at, rate, acceleration) - scene.core.forces(at, rate, still)[0]
-    return found
+def first_commands(problem: OptimalControlProblem, controls: JointValues | LinearPolicy | Solution | None) -> Commands:
+    """The commands of the first motion under given controls, within the problem's limits.
+
+    Raises:
+        InputError: Controls of a wrong shape, or of another hold or kind than the problem's.
+    """
+    m, variational, limits = problem.scene.controls, problem.integrator.variational, problem.control_limits
+    if isinstance(controls, Solution):
+        controls = controls.policy_on("momentum" if variational else "velocity")
+    if controls is None:
+        controls = problem.holding_policy()
+    if not isinstance(controls, LinearPolicy):
+        u = _rows_of(problem, controls)
+        if problem.linear:
+            line = open_line(problem.begun(np.clip(u, *limits)), problem.integrator.stage_times)
+            return line._replace(limits=limits)
+        return open_loop(u)._replace(hold=problem.hold, limits=limits)
+    if (hold := controls.hold_at(problem.dt)) != problem.hold:
+        raise InputError(f"the policy holds its controls over {hold} steps, the problem {problem.hold}")
+    if controls.linear != problem.linear:
+        policy, wanted = ("linear", "held") if controls.linear else ("held", "linear")
+        raise InputError(f"the policy's controls are {policy}, the problem's {wanted}")
+    commands = controls.commands(
+        problem.steps, m, problem.scene.robot.dof, variational, problem.dt, problem.integrator.stage_times
+    )
+    commands = commands._replace(limits=np.clip(commands.limits, *limits))
+    if problem.linear:
+        return commands._replace(before=problem.begun(np.clip(commands.before, *limits)))
+    if problem.rate is not None and problem.rate.before is not None:
+        return commands._replace(before=problem.rate.before[None])
+    return commands
+
+
+def _rows_of(problem: OptimalControlProblem, controls: Any) -> Floats:
+    """Given controls as rows (R, m)."""
+    R, m = problem.decisions, problem.scene.controls
+    if isinstance(controls, Mapping):
+        controls = control_array("controls", controls, problem.scene.control_joints)
+    rows = as_floats("controls", controls)
+    return np.broadcast_to(finite_array("controls", rows, (m,) if rows.ndim == 1 else (R, m)), (R, m))

@@ -20,7 +20,6 @@ from varpin.control.costs import CostError, Expansion
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.samples import after_impulse, at_samples, beyond_samples
 from varpin.linearization import Linearization, linearize_steps, velocity_at_nodes
-from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
 
 # Rounding errors of costs and states, in units of the last digit.
@@ -75,6 +74,12 @@ class Terminal(NamedTuple):
     slopes: Floats
 
 
+def states_of(problem: OptimalControlProblem) -> int:
+    """The number of states X of :class:`Recursion`."""
+    m, x = problem.scene.controls, 2 * problem.scene.robot.dof
+    return x + m + m % 2 if problem.linear or problem.rate is not None else x
+
+
 class Recursion(NamedTuple):
     """Steps as the backward recursion takes them, in z = (X, u).
 
@@ -96,6 +101,68 @@ class Recursion(NamedTuple):
         own = np.arange(free.shape[1])
         hessian[:, own, own] += 1.0 - free
         return Recursion(self.J * free[:, None], self.gradient * free, hessian, self.G, self.Gz * free[:, None, None])
+
+
+class Layout(NamedTuple):
+    """Where the variables of a problem are: z = (u_0, x_1, ..., x_hold, u_1, ...), and at the end a linear control."""
+
+    state: Integers  # (N + 1, 2n); -1 for the first one, which is given
+    control: Integers  # (R + 1, m); the last row is -1, for the control before the horizon
+    stage: Integers  # (N, Z) of the variables of steps: (x, u), or (x, w, u) of linear controls
+    decision: Integers  # (R, 2n + 2m) of x where a control, or the line to it, begins, the control before, and its own
+    size: int  # the number of variables
+
+    @classmethod
+    def of(cls, problem: OptimalControlProblem) -> Layout:
+        """The layout of a problem."""
+        N, hold, R, linear = problem.steps, problem.hold, problem.decisions, problem.linear
+        m, x = problem.scene.controls, 2 * problem.scene.robot.dof
+        span, step, own = m + hold * x, np.arange(N), np.arange(R)
+        state, control = np.full((N + 1, x), -1), np.full((R + 1, m), -1)
+        state[1:] = (step // hold * span + m + step % hold * x)[:, None] + np.arange(x)
+        control[:-1] = (own * span)[:, None] + np.arange(m)
+        ends = (control[step], control[step + 1]) if linear else (control[step // hold],)
+        begin = state[np.maximum(own - linear, 0) * hold]
+        return cls(
+            state,
+            control,
+            np.concatenate([state[:-1], *ends], axis=1),
+            np.concatenate([begin, control[own - 1], control[own]], axis=1),
+            N // hold * span + linear * m,
+        )
+
+    def joined(self, states: Floats, controls: Floats) -> Floats:
+        """The variables of changes of the states (N + 1, 2n) and of the controls (R, m)."""
+        z = np.empty(self.size)
+        z[self.state[1:]] = states[1:]
+        z[self.control[:-1]] = controls
+        return z
+
+
+class Cost(NamedTuple):
+    """Quadratic costs, each of some variables."""
+
+    at: Integers  # (K, Z) indices, -1 where there is none
+    gradient: Floats  # (K, Z)
+    hessian: Floats  # (K, Z, Z)
+
+
+class Rows(NamedTuple):
+    """The rows of one constraint, in tenths of its range."""
+
+    at: Integers  # (P, Z) indices of variables, -1 where there is none
+    slopes: Floats  # (P, Z)
+    equality: bool
+
+
+def change(costs: Sequence[Cost], z: Floats) -> tuple[float, float]:
+    """The slope of costs along z, and their change at z by the quadratic model."""
+    padded, slope, curvature = np.append(z, 0.0), 0.0, 0.0
+    for at, gradient, hessian in costs:
+        moved = padded[at]
+        slope += float((gradient * moved).sum())
+        curvature += float((moved * (hessian @ moved[:, :, None])[:, :, 0]).sum())
+    return slope, slope + 0.5 * curvature
 
 
 class Steps:
@@ -146,9 +213,15 @@ class Steps:
         return found
 
     @cached_property
+    def _at_samples(self) -> tuple[Floats, Floats, Floats]:
+        """q, v and u at the samples."""
+        motion = self.trajectory
+        return self.problem.samples(motion.q, motion.v, self.problem.control_rows(motion))
+
+    @cached_property
     def running(self) -> Expansion:
         """The running cost at its samples."""
-        found = self.problem.expand_running(self.trajectory)
+        found = self.problem.running.expand(*self._at_samples)
         for name, array in (("gradient", found.gradient), ("Hessian", found.hessian)):
             if not np.isfinite(array).all():
                 raise CostError(repr(self.problem.cost), f"its {name} along the motion is not finite")
@@ -163,7 +236,8 @@ class Steps:
     @cached_property
     def terminal(self) -> Terminal:
         """The terminal cost at the end of the motion."""
-        end, x = self.problem.expand_terminal(self.trajectory), slice(0, 2 * self.problem.scene.robot.dof)
+        problem, motion, x = self.problem, self.trajectory, slice(0, 2 * self.problem.scene.robot.dof)
+        end = problem.terminal.expand(motion.q[-1:], motion.v[-1:], np.zeros((1, problem.scene.controls)))
         # Contiguous, as the core takes them.
         cost = Expansion(end.gradient[:1, x], np.ascontiguousarray(end.hessian[:1, x, x]))
         D = self.slopes[-1]
@@ -178,18 +252,12 @@ class Steps:
         return problem.rate.expand(problem.decided(self.trajectory), problem.period)
 
     @cached_property
-    def slack(self) -> Floats:
-        """Distances (R, 2, m) of the controls from their limits."""
-        found: Floats = self.problem.control_limits - self.problem.decided(self.trajectory)[:, None]
-        return found
-
-    @cached_property
     def costs(self) -> tuple[Floats, Floats]:
         """Gradients (N, Z) and Hessians (N, Z, Z) of the running cost of each step in its variables."""
         problem, rule, m = self.problem, self.problem.rule, self.problem.scene.controls
         N, x, Z = self.J.shape
         D = np.zeros((N, len(rule), x + m, Z))
-        D[:, :, :x] = at_samples(rule, self.J, self._velocity if problem.integrator.variational else None)
+        D[:, :, :x] = at_samples(rule, self.J, self.slopes[:, x // 2 :])
         late = problem.places if problem.linear else np.ones(len(rule))
         D[:, :, x:, x : x + m] = (1.0 - late)[:, None, None] * np.eye(m)
         D[:, :, x:, Z - m :] = late[:, None, None] * np.eye(m)
@@ -203,14 +271,15 @@ class Steps:
         """Of :attr:`kicked` (N, 2n, 2n) per dt what no sample sees, and so no path; None if nothing."""
         x = 2 * self.problem.scene.robot.dof
         hessian = self._hessians[:, :, :x, :x]
-        return beyond_samples(self.problem, self.trajectory, self.lin, hessian, self._velocity)
+        end = self.terminal.cost.hessian[0]
+        return beyond_samples(self.problem, self.trajectory, self.lin, hessian, self._velocity, end)
 
     @cached_property
     def kicked(self) -> Floats:
         """Hessians (N, 2n, 2n) of what the noise of a step costs within it, in its effect on the state after it."""
         x, problem = 2 * self.problem.scene.robot.dof, self.problem
-        velocity = self._velocity if problem.integrator.variational else None
-        found = after_impulse(problem.rule, self._hessians[:, :, :x, :x], velocity, problem.dt)
+        hessian, velocity = self._hessians[:, :, :x, :x], self.slopes[:, x // 2 :]
+        found = after_impulse(problem.rule, hessian, velocity, problem.dt)
         return problem.dt * (found if self.beyond is None else found + self.beyond)
 
     def of_noise(self, spread: Floats) -> tuple[Floats, Floats]:
@@ -241,15 +310,9 @@ class Steps:
             found[1::2, own] = 2.0 * np.eye(m, Z, Z - m) - np.eye(m, Z, x)
         return found
 
-    @property
-    def states(self) -> int:
-        """The number of states X of :class:`Recursion`."""
-        m, x = self.problem.scene.controls, 2 * self.problem.scene.robot.dof
-        return x + m + m % 2 if self.problem.linear or self.problem.rate is not None else x
-
     @cached_property
     def _wide(self) -> Recursion:
-        problem, (N, x, _), X = self.problem, self.J.shape, self.states
+        problem, (N, x, _), X = self.problem, self.J.shape, states_of(self.problem)
         gradient, hessian = (part / problem.dt for part in self.costs)
         if self.lin.G.shape[2]:
             slope, bend = self.of_noise(self.kicked / problem.dt)
@@ -282,7 +345,7 @@ class Steps:
     def _places(self) -> Integers:
         """Where the variables of steps are in z of :class:`Recursion`."""
         m, Z = self.problem.scene.controls, self.J.shape[2]
-        return np.concatenate([np.arange(Z - m), self.states + np.arange(m)])
+        return np.concatenate([np.arange(Z - m), states_of(self.problem) + np.arange(m)])
 
     def recursion(self, curvature: Floats | None, fixed: Mask | None) -> Recursion:
         """The steps for the recursion, with second derivatives (N, Z, Z), and controls (R, m) that stay ``fixed``."""
@@ -304,7 +367,7 @@ class Steps:
             could, does = _stakes(expansion, change)
             free, moved = free + factor * could, moved + factor * does
         if self.problem.rate is not None:
-            rate = float(self.problem.rate.value(self.problem.decided(self.trajectory), self.problem.period))
+            rate = float(self.problem.rate.shares(self.problem.decided(self.trajectory), self.problem.period).sum())
             free, moved = free + rate, moved + rate
         return Stake(free, moved)
 
@@ -320,183 +383,72 @@ class Steps:
     def _models(self) -> tuple[tuple[float, Expansion, Floats], ...]:
         """Weights, expansions and variables of the cost at the samples, (q, v, u), and at the end, (q, v)."""
         problem, motion = self.problem, self.trajectory
-        along = np.concatenate(problem.samples(motion.q, motion.v, problem.control_rows(motion)), axis=1)
+        along = np.concatenate(self._at_samples, axis=1)
         end = np.concatenate([motion.q[-1:], motion.v[-1:]], axis=1)
         return (problem.dt * float(problem.rule[0, 0]), self.running, along), (1.0, self.terminal.cost, end)
 
+    @cached_property
+    def layout(self) -> Layout:
+        """Where the variables are."""
+        return Layout.of(self.problem)
 
-class Layout(NamedTuple):
-    """Where the variables of a problem are: z = (u_0, x_1, ..., x_hold, u_1, ...), and at the end a linear control."""
+    def quadratic(self, spread: Floats | None = None, curvature: Floats | None = None) -> list[Cost]:
+        """The costs of the steps, of the end and of control changes, (O10).
 
-    states: int  # 2n
-    controls: int  # m
-    stages: int  # N, the number of steps
-    hold: int  # steps that share a control
-    linear: bool  # whether there is a control at the end
-
-    @classmethod
-    def of(cls, problem: OptimalControlProblem) -> Layout:
-        """The layout of a problem."""
-        scene = problem.scene
-        return cls(2 * scene.robot.dof, scene.controls, problem.steps, problem.hold, problem.linear)
-
-    @property
-    def _span(self) -> int:
-        """The number of variables of a decision and the states after it."""
-        return self.controls + self.hold * self.states
-
-    @property
-    def size(self) -> int:
-        """The number of variables."""
-        return self.stages // self.hold * self._span + self.linear * self.controls
-
-    def state(self, k: Integers) -> Integers:
-        """Indices (K, 2n) of states at nodes; -1 for the first one, which is given."""
-        decision, step = np.divmod(k - 1, self.hold)
-        own = (decision * self._span + self.controls + step * self.states)[:, None] + np.arange(self.states)
-        return np.where(k[:, None] > 0, own, -1)
-
-    def control(self, r: Integers) -> Integers:
-        """Indices (K, m) of controls; -1 for that before the horizon."""
-        return np.where(r[:, None] >= 0, (r * self._span)[:, None] + np.arange(self.controls), -1)
-
-    def in_stage(self, k: Integers) -> Integers:
-        """Indices (K, Z) of the variables of steps: (x, u), or (x, w, u) of linear controls."""
-        ends = (k, k + 1) if self.linear else (k // self.hold,)
-        return np.concatenate([self.state(k), *map(self.control, ends)], axis=1)
-
-    def decisions(self, feedback: Floats, previous: Floats | None) -> tuple[Integers, Floats]:
-        """The changes of controls beside feedback, u - K x - G w: indices (R, Z) and derivatives (R, m, Z).
-
-        K (R, m, 2n) is on the state where a held control, or the line to a linear one, begins, G (R, m, m) on the
-        previous control w.
+        With what noise costs by Hessians S (N, 2n, 2n), and second derivatives (N, Z, Z) of the steps.
         """
-        R, m, _ = feedback.shape
-        r = np.arange(R)
-        w = np.zeros((R, m, m)) if previous is None else previous
-        at = np.concatenate([self.state((r - self.linear) * self.hold), self.control(r - 1), self.control(r)], axis=1)
-        return at, np.concatenate([-feedback, -w, np.broadcast_to(np.eye(m), w.shape)], axis=2)
-
-    def controls_of(self, z: Floats) -> Floats:
-        """The changes of the controls (R, m) in z."""
-        return z[self.control(np.arange(self.stages // self.hold + self.linear))]
-
-    def joined(self, states: Floats, controls: Floats) -> Floats:
-        """The variables of changes of the states (N + 1, 2n) and of the controls (R, m)."""
-        z = np.empty(self.size)
-        z[self.state(np.arange(1, self.stages + 1))] = states[1:]
-        z[self.control(np.arange(len(controls)))] = controls
-        return z
-
-
-class Cost(NamedTuple):
-    """Quadratic costs, each of some variables."""
-
-    at: Integers  # (K, Z) indices, -1 where there is none
-    gradient: Floats  # (K, Z)
-    hessian: Floats  # (K, Z, Z)
-
-
-class Rows(NamedTuple):
-    """The rows of one constraint, in tenths of its range."""
-
-    values: Floats  # (P,) c with its margin
-    at: Integers  # (P, Z) indices of variables, -1 where there is none
-    slopes: Floats  # (P, Z)
-    equality: bool
-
-
-@dataclass(frozen=True, eq=False)
-class Stages(Frozen):
-    """The expansions along a motion, the matrices of (O10)."""
-
-    steps: Steps
-    layout: Layout
-    costs: tuple[Cost, ...]  # of the steps, of the end and of control changes
-
-    @property
-    def J(self) -> Floats:
-        """Derivatives of the state after each step in its variables (N, 2n, Z)."""
-        return self.steps.J
-
-    @classmethod
-    def along(cls, steps: Steps, spread: Floats | None = None, curvature: Floats | None = None) -> Stages:
-        """The stages of a motion, with what noise costs by Hessians S (N, 2n, 2n), and second derivatives (N, Z, Z)."""
-        layout, (gradient, hessian) = Layout.of(steps.problem), steps.costs
+        layout, (gradient, hessian) = self.layout, self.costs
         if spread is not None:
-            gradient, hessian = (a + b for a, b in zip((gradient, hessian), steps.of_noise(spread), strict=True))
+            gradient, hessian = (a + b for a, b in zip((gradient, hessian), self.of_noise(spread), strict=True))
         if curvature is not None:
             hessian = hessian + curvature
-        costs = [Cost(layout.in_stage(np.arange(layout.stages)), gradient, hessian)]
-        end, (pull, rate), r = steps.terminal, steps.rate, np.arange(len(steps.rate[0]))
-        costs.append(Cost(layout.state(np.array([layout.stages])), end.gradient[None], end.hessian[None]))
+        costs, end, (pull, rate) = [Cost(layout.stage, gradient, hessian)], self.terminal, self.rate
+        costs.append(Cost(layout.state[-1:], end.gradient[None], end.hessian[None]))
         if len(rate):
-            at = np.concatenate([layout.control(r - 1), layout.control(r)], axis=1)
+            at = layout.decision[:, layout.state.shape[1] :]
             costs.append(Cost(at, np.concatenate([-pull, pull], axis=1), np.block([[rate, -rate], [-rate, rate]])))
-        return cls(steps, layout, tuple(costs))
+        return costs
 
-    def rows(self, bound: BoundConstraint, margin: Floats) -> Rows:
-        """The rows of a constraint along the motion, with a margin (K, rows)."""
-        motion, u = self.steps.trajectory, self.steps.problem.control_rows(self.steps.trajectory)
-        values = (bound.value(motion.q, motion.v, u) + margin).ravel() / bound.scale
+    def rows(self, bound: BoundConstraint) -> Rows:
+        """The rows of a constraint along the motion."""
         at, slopes = self._in_decisions(bound)
-        return Rows(values, at, slopes / bound.scale, bound.source.equality)
+        return Rows(at, slopes / bound.scale, bound.source.equality)
 
     def _in_decisions(self, bound: BoundConstraint) -> tuple[Integers, Floats]:
         """Indices (P, Z) of the variables of a constraint's rows, and derivatives."""
-        layout, motion = self.layout, self.steps.trajectory
+        layout, motion = self.layout, self.trajectory
         if isinstance(bound, BoundRate):
             columns = bound.limited
-            at = np.stack([layout.control(bound.places - 1)[:, columns], layout.control(bound.places)[:, columns]], 2)
+            at = np.stack([layout.control[bound.places - back][:, columns] for back in (1, 0)], axis=2)
             pair = np.broadcast_to(np.array([-1.0, 1.0]) / bound.period, at.shape)
             return np.concatenate([at, at], axis=1).reshape(-1, 2), np.concatenate([pair, -pair], 1).reshape(-1, 2)
         if isinstance(bound, BoundBetween) and bound.ends is not None:
-            J = bound.slopes(motion.q, motion.v, self.steps.problem.control_rows(motion))
-            begins, x = bound.places - 1, layout.states
-            at = layout.in_stage(begins)
-            J = np.concatenate([J[:, :, :x] @ self.steps.slopes[begins], J[:, :, x:]], axis=2)
+            J = bound.slopes(motion.q, motion.v, self.problem.control_rows(motion))
+            begins, x = bound.places - 1, layout.state.shape[1]
+            at = layout.stage[begins]
+            J = np.concatenate([J[:, :, :x] @ self.slopes[begins], J[:, :, x:]], axis=2)
         else:
             nodes, slopes = [bound.places], [bound.jacobian(motion.q, motion.v)]
             if isinstance(bound, BoundBetween):
                 nodes, slopes = [bound.places - 1, bound.places], bound.by_nodes(slopes[0])
-            at = np.concatenate([layout.state(k) for k in nodes], axis=1)
-            J = np.concatenate([part @ self.steps.slopes[k] for k, part in zip(nodes, slopes, strict=True)], axis=2)
+            at = np.concatenate([layout.state[k] for k in nodes], axis=1)
+            J = np.concatenate([part @ self.slopes[k] for k, part in zip(nodes, slopes, strict=True)], axis=2)
         return np.repeat(at, len(bound.rows), axis=0), J.reshape(-1, J.shape[2])
 
-    def change(self, z: Floats) -> tuple[float, float]:
-        """The slope of the cost along z, and its change at z by the quadratic model."""
-        padded, slope, curvature = np.append(z, 0.0), 0.0, 0.0
-        for at, gradient, hessian in self.costs:
-            moved = np.where(at >= 0, padded[at], 0.0)
-            slope += float((gradient * moved).sum())
-            curvature += float((moved * (hessian @ moved[:, :, None])[:, :, 0]).sum())
-        return slope, slope + 0.5 * curvature
-
-    def slopes(self, rows: Sequence[Rows], multipliers: Sequence[Floats]) -> Floats:
-        """The gradient of the Lagrangian in the controls (R, m), by costates."""
-        return self.layout.controls_of(self._lagrangian(rows, multipliers))
-
-    def costates(self, rows: Sequence[Rows], multipliers: Sequence[Floats]) -> Floats:
-        """Derivatives (R, 2n) of the Lagrangian in the state after each stage."""
-        return self._lagrangian(rows, multipliers)[self.layout.state(np.arange(1, self.layout.stages + 1))]
-
-    def _lagrangian(self, rows: Sequence[Rows], multipliers: Sequence[Floats]) -> Floats:
+    def lagrangian(self, costs: Sequence[Cost], rows: Sequence[Rows], multipliers: Sequence[Floats]) -> Floats:
         """Derivatives of the Lagrangian in all variables, states after them left free."""
         layout = self.layout
         total = np.zeros(layout.size + 1)
-        for at, gradient, _ in self.costs:
+        for at, gradient, _ in costs:
             np.add.at(total, at, gradient)
         for row, push in zip(rows, multipliers, strict=True):
             np.add.at(total, row.at, push[:, None] * row.slopes)
-        at = layout.in_stage(np.arange(layout.stages))
-        for k in range(layout.stages - 1, -1, -1):
-            np.add.at(total, at[k], self.J[k].T @ total[layout.state(np.array([k + 1]))[0]])
+        for k in range(len(self.J) - 1, -1, -1):
+            np.add.at(total, layout.stage[k], self.J[k].T @ total[layout.state[k + 1]])
         return total
 
     def gaps_of(self, z: Floats) -> Floats:
         """What the linearized stages miss the states in z by (R, 2n)."""
-        k, padded = np.arange(self.layout.stages), np.append(z, 0.0)
-        at = self.layout.in_stage(k)
-        moved = np.where(at >= 0, padded[at], 0.0)
-        found: Floats = (self.J @ moved[:, :, None])[:, :, 0] - z[self.layout.state(k + 1)]
+        moved = np.append(z, 0.0)[self.layout.stage]
+        found: Floats = (self.J @ moved[:, :, None])[:, :, 0] - z[self.layout.state[1:]]
         return found

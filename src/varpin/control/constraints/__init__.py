@@ -1,7 +1,9 @@
 """Hard constraints of a plan, one file for each family."""
 
 from varpin.control.constraints.base import BoundConstraint as BoundConstraint
+from varpin.control.constraints.base import BoundStates as BoundStates
 from varpin.control.constraints.base import Horizon as Horizon
+from varpin.control.constraints.base import OfStates as OfStates
 from varpin.control.constraints.base import PlanConstraint as PlanConstraint
 from varpin.control.constraints.clearance import KeepClear as KeepClear
 from varpin.control.constraints.frames import KeepInBox as KeepInBox

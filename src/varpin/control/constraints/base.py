@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
 from varpin.arrays import Floats, Integers
 from varpin.errors import InputError
 from varpin.model import Robot
+from varpin.model.kinematics import require_same
 from varpin.support.checks import finite
 from varpin.support.frozen import Frozen
 
@@ -135,14 +136,61 @@ class PlanConstraint(Frozen, ABC):
         return type(self).__name__
 
     def __repr__(self) -> str:
-        """All parameters to the last digit, for comparison with other constraints."""
-        values = {name: value for name, value in vars(self).items() if not isinstance(value, Robot) and name[0] != "_"}
-        arguments = (f"{name}={_argument(value)}" for name, value in values.items() if name != "kinematics")
-        return f"{type(self).__name__}({', '.join(arguments)})"
+        return self.label
 
 
-def _argument(value: object) -> str:
-    return repr(value.tolist() if isinstance(value, np.ndarray) else value)
+class OfStates(PlanConstraint):
+    """A constraint on the states at all nodes after the first; an equality is one on the last state."""
+
+    robot: Robot
+    _rows: tuple[str, ...]
+    _unit = "m"
+    _scale = LENGTH
+
+    def bind(self, horizon: Horizon) -> BoundConstraint:
+        require_same(self.label, self.robot, horizon.robot)
+        last = slice(-1 if self.equality else 0, None)
+        places, times = horizon.places[0][last], horizon.places[1][last]
+        return BoundStates(self, places, times, self._rows, self._unit, self._scale, self.at(times))
+
+    def at(self, times: Floats) -> Self:  # noqa: ARG002
+        """The constraint at times (K,) [s]: row i of states then belongs to the time i mod K.
+
+        Raises:
+            InputError: A user's function of time fails.
+        """
+        return self
+
+    @abstractmethod
+    def values(self, q: Floats, v: Floats) -> Floats:
+        """The values c (P, rows) at states q and v (P, n)."""
+
+    @abstractmethod
+    def slopes(self, q: Floats, v: Floats) -> Floats:
+        """dc/dq (P, rows, n) or dc/d(q, v) (P, rows, 2n)."""
+
+    def jacobian(self, q: Floats, v: Floats) -> Floats:
+        """dc/d(q, v) (P, rows, 2n) at states q and v (P, n)."""
+        found = self.slopes(q, v)
+        return np.pad(found, ((0, 0), (0, 0), (0, 2 * q.shape[1] - found.shape[2])))
+
+
+@dataclass(frozen=True, eq=False)
+class BoundStates(BoundConstraint):
+    """A constraint on states on a grid.
+
+    Attributes:
+        of: The constraint at the times of its places.
+    """
+
+    of: OfStates
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
+        at = [np.ascontiguousarray(x[..., self.places, :]).reshape(-1, x.shape[-1]) for x in (q, v)]
+        return self.of.values(*at).reshape(*q.shape[:-2], *self.shape)
+
+    def jacobian(self, q: Floats, v: Floats) -> Floats:
+        return self.of.jacobian(q[self.places], v[self.places])
 
 
 def checked_margin(constraint: PlanConstraint, margin: object) -> float:

@@ -4,42 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import Self
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
-from varpin.control.constraints.base import (
-    LENGTH,
-    BoundConstraint,
-    Horizon,
-    PlanConstraint,
-    checked_margin,
-)
+from varpin.control.constraints.base import OfStates, checked_margin
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
-from varpin.model.clearance import Clearance, Obstacle, clearance
-from varpin.model.kinematics import require_same
+from varpin.model.clearance import Obstacle, clearance
 from varpin.support.checks import finite, flag, path_like, tuple_of
 
 
-@dataclass(frozen=True, eq=False)
-class _BoundClearance(BoundConstraint):
-    of: Clearance
-    distance: float
-
-    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
-        at = q[..., self.places, :]
-        found = self.of.distances(at.reshape(-1, at.shape[-1]))
-        return (self.distance - found).reshape(*at.shape[:-1], len(self.rows))
-
-    def jacobian(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
-        slopes = -self.of.slopes(np.ascontiguousarray(q[self.places]))
-        return np.concatenate([slopes, np.zeros_like(slopes)], axis=2)
-
-
-class KeepClear(PlanConstraint):
+class KeepClear(OfStates):
     """distance(q) >= distance for every pair, at every node after the first: links stay clear of obstacles.
 
     Each link is modelled by the smallest capsule around its shapes, which is larger than the link; ``capsules`` gives
@@ -47,7 +24,6 @@ class KeepClear(PlanConstraint):
     nearest points.
     """
 
-    robot: Robot
     obstacles: tuple[Obstacle, ...]
 
     def __init__(
@@ -99,7 +75,16 @@ class KeepClear(PlanConstraint):
             name: (begin.tolist(), end.tolist(), radius) for name, (begin, end, radius) in self._of.capsules.items()
         }
 
-    def bind(self, horizon: Horizon) -> BoundConstraint:
-        require_same(self.label, self.robot, horizon.robot)
-        places, times = horizon.places
-        return _BoundClearance(self, places, times, self.pairs, "m", LENGTH, self._of.over(times), self.distance)
+    @property
+    def _rows(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.pairs
+
+    def at(self, times: Floats) -> Self:
+        return self.changed(_of=self._of.over(times))
+
+    def values(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
+        found: Floats = self.distance - self._of.distances(q)
+        return found
+
+    def slopes(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
+        return -self._of.slopes(q)

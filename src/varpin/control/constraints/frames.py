@@ -4,23 +4,17 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
-from varpin.control.constraints.base import (
-    LENGTH,
-    BoundConstraint,
-    Horizon,
-    PlanConstraint,
-    checked_margin,
-)
+from varpin.control.constraints.base import OfStates, checked_margin
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
-from varpin.model.kinematics import frame_kinematics, require_same
+from varpin.model.kinematics import frame_kinematics
 from varpin.support.checks import finite, finite_array, named_limits, over_time, positive, rotation_matrix
 
 _XYZ = ("x", "y", "z")
@@ -28,14 +22,14 @@ _XYZ = ("x", "y", "z")
 _SMALL = 1e-3
 
 
-class _OfFrame(PlanConstraint):
-    robot: Robot
+class _OfFrame(OfStates):
     frame: str
 
-    def _take(self, robot: Robot, frame: str) -> None:
+    def __init__(self, robot: Robot, frame: str, margin: float = 0.0) -> None:
         self.robot = require_robot(robot, type(self).__name__)
         self.kinematics = frame_kinematics(robot, frame)
         self.frame = frame
+        self.margin = checked_margin(self, margin)
 
     @property
     def label(self) -> str:
@@ -62,45 +56,35 @@ class ReachFrame(_OfFrame):
             position: Goal of its origin in the world (3,) [m]; by default free.
             rotation: Goal of its rotation matrix, from the frame's axes to the world's (3, 3); by default free.
         """
-        self._take(robot, frame)
+        super().__init__(robot, frame)
         if position is None and rotation is None:
             raise InputError("ReachFrame takes a position, a rotation or both")
         self.position = None if position is None else finite_array("ReachFrame position", position, (3,))
         self.rotation = None if rotation is None else rotation_matrix("ReachFrame rotation", rotation)
 
-    def bind(self, horizon: Horizon) -> BoundConstraint:
-        require_same(self.label, self.robot, horizon.robot)
-        rows: tuple[str, ...] = () if self.position is None else tuple(f"position {axis}" for axis in _XYZ)
-        rows += () if self.rotation is None else tuple(f"rotation {axis}" for axis in _XYZ)
-        unit = "m and rad" if len(rows) == 6 else "m" if self.rotation is None else "rad"
-        return _BoundGoal(self, np.array([horizon.steps]), horizon.t[-1:], rows, unit, LENGTH, self)
+        self._rows = () if self.position is None else tuple(f"position {axis}" for axis in _XYZ)
+        self._rows += () if self.rotation is None else tuple(f"rotation {axis}" for axis in _XYZ)
+        self._unit = "m and rad" if len(self._rows) == 6 else "m" if self.rotation is None else "rad"
+
+    def values(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
+        R, p = self.kinematics.placements(q)
+        found = [] if self.position is None else [p - self.position]
+        found += [] if self.rotation is None else [_turns(self.rotation.T @ R)]
+        return np.concatenate(found, axis=1)
+
+    def slopes(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
+        R, _, J = self.kinematics.jacobians(q)
+        found = [] if self.position is None else [J[:, :3]]
+        if self.rotation is not None:
+            of_body = np.array([_log_slope(turn) for turn in _turns(self.rotation.T @ R)]) @ np.swapaxes(R, 1, 2)
+            found.append(of_body @ J[:, 3:])
+        return np.concatenate(found, axis=1)
 
 
-@dataclass(frozen=True, eq=False)
-class _BoundGoal(BoundConstraint):
-    goal: ReachFrame
-
-    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
-        end = q[..., -1, :]
-        R, p = self.goal.kinematics.placements(np.ascontiguousarray(end.reshape(-1, end.shape[-1])))
-        found: Floats = np.concatenate(self._residuals(R, p), axis=1).reshape(*end.shape[:-1], 1, len(self.rows))
-        return found
-
-    def _residuals(self, R: Floats, p: Floats) -> list[Floats]:
-        found = [] if self.goal.position is None else [p - self.goal.position]
-        if self.goal.rotation is not None:
-            turn = scipy.spatial.transform.Rotation.from_matrix(self.goal.rotation.T @ R)
-            found.append(turn.as_rotvec())
-        return found
-
-    def jacobian(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
-        n = q.shape[-1]
-        R, p, J = self.goal.kinematics.jacobians(q[-1:])
-        blocks = [] if self.goal.position is None else [J[0, :3]]
-        if self.goal.rotation is not None:
-            blocks.append(_log_slope(self._residuals(R, p)[-1][0]) @ R[0].T @ J[0, 3:])
-        rows = np.vstack(blocks)
-        return np.hstack([rows, np.zeros((len(rows), n))])[None]
+def _turns(R: Floats) -> Floats:
+    """The rotation vectors (N, 3) of rotations (N, 3, 3)."""
+    turns: Floats = scipy.spatial.transform.Rotation.from_matrix(R).as_rotvec()
+    return turns
 
 
 def _log_slope(e: Floats) -> Floats:
@@ -113,48 +97,18 @@ def _log_slope(e: Floats) -> Floats:
     return slope
 
 
-@dataclass(frozen=True, eq=False)
-class BoundRegion(BoundConstraint):
-    """A region on a grid."""
-
-    region: _Region
-    shifts: Floats  # displacement of the region at each place (K, 3), or (1, 3) where it does not move
-
-    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
-        at = q[..., self.places, :]
-        _, p = self.region.kinematics.placements(np.ascontiguousarray(at.reshape(-1, at.shape[-1])))
-        p = (p.reshape(*at.shape[:-1], 3) - self.shifts).reshape(-1, 3)
-        return self.region.distances(p).reshape(*at.shape[:-1], len(self.rows))
-
-    def jacobian(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
-        _, p, J = self.region.kinematics.jacobians(np.ascontiguousarray(q[self.places]))
-        slopes = self.region.slopes(p - self.shifts) @ J[:, :3]
-        return np.concatenate([slopes, np.zeros_like(slopes)], axis=2)
-
-
 class _Region(_OfFrame):
-    _rows: tuple[str, ...]
-
     @abstractmethod
-    def distances(self, p: Floats) -> Floats:
-        """Distances of positions p (N, 3) [m] outside of the region's bounds (N, rows) [m]."""
+    def measured(self, p: Floats) -> tuple[Floats, Floats]:
+        """Distances of positions p (P, 3) outside of bounds (P, rows) [m], and their derivatives (P, rows, 3)."""
 
-    @abstractmethod
-    def slopes(self, p: Floats) -> Floats:
-        """Derivatives of the distances in p (N, rows, 3)."""
+    def values(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
+        return self.measured(self.kinematics.placements(q)[1])[0]
 
-    def bind(self, horizon: Horizon) -> BoundConstraint:
-        require_same(self.label, self.robot, horizon.robot)
-        places, times = horizon.places
-        return BoundRegion(self, places, times, self._rows, "m", LENGTH, self, self.shifts(times))
-
-    def shifts(self, times: Floats) -> Floats:  # noqa: ARG002
-        """Displacements of the region at given times (K,) [s]: (K, 3), or (1, 3) where it does not move [m].
-
-        Raises:
-            InputError: A user's function fails.
-        """
-        return np.zeros((1, 3))
+    def slopes(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
+        _, p, J = self.kinematics.jacobians(q)
+        found: Floats = self.measured(p)[1] @ J[:, :3]
+        return found
 
 
 class _WithinPlanes(_Region):
@@ -163,12 +117,8 @@ class _WithinPlanes(_Region):
     _outward: Floats
     _most: Floats
 
-    def distances(self, p: Floats) -> Floats:
-        found: Floats = p @ self._outward.T - self._most
-        return found
-
-    def slopes(self, p: Floats) -> Floats:
-        return np.broadcast_to(self._outward, (len(p), *self._outward.shape))
+    def measured(self, p: Floats) -> tuple[Floats, Floats]:
+        return p @ self._outward.T - self._most, np.broadcast_to(self._outward, (len(p), *self._outward.shape))
 
 
 class KeepInHalfSpace(_WithinPlanes):
@@ -187,14 +137,13 @@ class KeepInHalfSpace(_WithinPlanes):
                 world's origin along it [m].
             margin: In standard deviations of the distance under noise.
         """
-        self._take(robot, frame)
+        super().__init__(robot, frame, margin)
         given = finite_array("KeepInHalfSpace normal", normal, (3,))
         length = float(np.linalg.norm(given))
         if not length > 0.0:
             raise InputError("KeepInHalfSpace normal must not be zero")
         self.normal = given / length
         self.offset = finite("KeepInHalfSpace offset", offset) / length
-        self.margin = checked_margin(self, margin)
         self._outward, self._most = -self.normal[None], np.array([-self.offset])
 
 
@@ -208,11 +157,10 @@ class KeepInBox(_WithinPlanes):
             lower: One number or (3,) in the world, infinite where there is no limit [m].
             upper: Likewise.
         """
-        self._take(robot, frame)
+        super().__init__(robot, frame, margin)
         self.limits = named_limits("KeepInBox", (lower, upper), None, 3)
         if not np.isfinite(self.limits).any():
             raise InputError("KeepInBox has no finite side")
-        self.margin = checked_margin(self, margin)
         # Upper sides, then lower ones.
         sides, axes = np.nonzero(np.isfinite(self.limits[::-1]))
         signs = np.where(sides == 0, 1.0, -1.0)
@@ -224,6 +172,7 @@ class KeepInBox(_WithinPlanes):
 class _OfSphere(_Region):
     outside: bool
     center: Floats | Callable[[float], ArrayLike]
+    _centers: Floats
     _rows = ("the sphere",)
 
     def __init__(
@@ -241,29 +190,28 @@ class _OfSphere(_Region):
             center: Centre in the world (3,) [m], or a function of time [s] that returns it.
             radius: Radius [m].
         """
-        self._take(robot, frame)
+        super().__init__(robot, frame, margin)
         name = type(self).__name__
         self.center = center if callable(center) else finite_array(f"{name} center", center, (3,))
         self.radius = positive(f"{name} radius", radius, "m")
-        self.margin = checked_margin(self, margin)
 
-    def shifts(self, times: Floats) -> Floats:
-        """See the base: positions are relative to the centre."""
+    def at(self, times: Floats) -> Self:
+        return self.changed(_centers=self.centers(times))
+
+    def centers(self, times: Floats) -> Floats:
+        """The centre at times (K,) [s]: (K, 3), or (1, 3) where it does not move [m]."""
         if callable(self.center):
             return over_time(f"{type(self).__name__} center", self.center, times, 3)
         return self.center[None]
 
-    def distances(self, p: Floats) -> Floats:
-        beyond: Floats = np.linalg.norm(p, axis=1, keepdims=True) - self.radius
-        return -beyond if self.outside else beyond
-
-    def slopes(self, p: Floats) -> Floats:
-        length = np.linalg.norm(p, axis=1, keepdims=True)
+    def measured(self, p: Floats) -> tuple[Floats, Floats]:
+        away = (p.reshape(-1, *self._centers.shape) - self._centers).reshape(-1, 3)
+        length = np.linalg.norm(away, axis=1, keepdims=True)
         # At the centre, where the distance has no gradient: any direction to leave the sphere, none to stay inside.
         fixed = np.array([0.0, 0.0, 1.0 if self.outside else 0.0])
-        unit = np.where(length > 0.0, p / np.where(length > 0.0, length, 1.0), fixed)
-        found: Floats = (-unit if self.outside else unit)[:, None]
-        return found
+        unit = np.where(length > 0.0, away / np.where(length > 0.0, length, 1.0), fixed)
+        sign = -1.0 if self.outside else 1.0
+        return sign * (length - self.radius), sign * unit[:, None]
 
 
 class KeepInSphere(_OfSphere):

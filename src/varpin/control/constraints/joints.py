@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from varpin.arrays import Floats, Integers
-from varpin.control.constraints.base import LENGTH, BoundConstraint, Horizon, PlanConstraint, checked_margin
+from varpin.control.constraints.base import LENGTH, BoundConstraint, Horizon, OfStates, PlanConstraint, checked_margin
 from varpin.errors import InputError
 from varpin.model import Robot, joint_unit, require_robot
-from varpin.model.kinematics import require_same
 from varpin.support.checks import (
     JointValues,
     as_floats,
@@ -23,21 +22,7 @@ from varpin.support.checks import (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class _BoundLinear(BoundConstraint):
-    slopes: Floats  # in (q, v), (rows, 2n)
-    bounds: Floats  # (rows,)
-
-    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
-        found: Floats = np.concatenate([q, v], axis=-1)[..., self.places, :] @ self.slopes.T - self.bounds
-        return found
-
-    def jacobian(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
-        return np.broadcast_to(self.slopes, (len(self.places), *self.slopes.shape))
-
-
-class _WithinLimits(PlanConstraint):
-    robot: Robot
+class _WithinLimits(OfStates):
     limits: Floats
     in_velocity: bool
 
@@ -57,27 +42,27 @@ class _WithinLimits(PlanConstraint):
         own = (-robot.velocity_limit, robot.velocity_limit) if self.in_velocity else robot.position_limits
         self.limits = some_limits(name, limits, own, robot.name, robot.joint_names)
         self.margin = checked_margin(self, margin)
-
-    def bind(self, horizon: Horizon) -> BoundConstraint:
-        require_same(self.label, self.robot, horizon.robot)
         # Upper limits, then lower ones.
         sides, columns = np.nonzero(np.isfinite(self.limits[::-1]))
-        signs, slopes = np.where(sides == 0, 1.0, -1.0), np.zeros((len(sides), 2 * self.robot.dof))
-        slopes[np.arange(len(sides)), columns + self.in_velocity * self.robot.dof] = signs
+        self._columns, self._signs = columns + self.in_velocity * robot.dof, np.where(sides == 0, 1.0, -1.0)
+        self._bounds = self._signs * self.limits[::-1][sides, columns]
         names = ("upper", "lower")
+        self._rows = tuple(
+            f"{names[side]} limit of {robot.joint_names[c]}" for side, c in zip(sides, columns, strict=True)
+        )
+        self._unit = joint_unit(robot, sorted(set(columns.tolist())), speed=self.in_velocity)
         ranges = self.limits[1] - self.limits[0]
         whole = ranges[np.isfinite(ranges) & (ranges > 0.0)]
-        return _BoundLinear(
-            self,
-            *horizon.places,
-            tuple(
-                f"{names[side]} limit of {self.robot.joint_names[c]}" for side, c in zip(sides, columns, strict=True)
-            ),
-            joint_unit(self.robot, sorted(set(columns.tolist())), speed=self.in_velocity),
-            0.1 * float(np.median(whole)) if whole.size else LENGTH,
-            slopes,
-            signs * self.limits[::-1][sides, columns],
-        )
+        self._scale = 0.1 * float(np.median(whole)) if whole.size else LENGTH
+
+    def values(self, q: Floats, v: Floats) -> Floats:
+        found: Floats = np.concatenate([q, v], axis=1)[:, self._columns] * self._signs - self._bounds
+        return found
+
+    def slopes(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
+        found = np.zeros((len(q), len(self._signs), 2 * self.robot.dof))
+        found[:, np.arange(len(self._signs)), self._columns] = self._signs
+        return found
 
 
 class WithinJointLimits(_WithinLimits):

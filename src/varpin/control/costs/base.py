@@ -24,7 +24,7 @@ from varpin.core import CostTerms, Subject
 from varpin.errors import InputError, VarpinError
 from varpin.model import Robot
 from varpin.model.kinematics import FrameKinematics, Links
-from varpin.support.checks import as_floats, require_finite, returned
+from varpin.support.checks import as_floats, require_finite, returned, rotation_matrix
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts
 from varpin.trajectory import Trajectory
@@ -126,11 +126,6 @@ class Cost(Frozen, ABC):
     factor: float = 1.0
     at_end: bool = False
     of_controls: bool = False
-
-    @property
-    def timed(self) -> bool:
-        """Whether the result of :meth:`bind` depends on the points' times, not only on their number."""
-        return True
 
     @abstractmethod
     def bind(self, points: Points) -> BoundCost:
@@ -364,11 +359,6 @@ def weight_matrix(name: str, weight: Floats, size: int) -> Floats:
     return weight * np.eye(size) if weight.ndim < 2 else weight
 
 
-def checked_reference(name: str, reference: ReferenceValues) -> ReferenceValues:
-    """A function of time, or an array of numbers."""
-    return reference if callable(reference) else as_floats(f"{name} reference", reference)
-
-
 def sample(
     name: str, reference: ReferenceValues, points: Points, shape: tuple[int, ...], *, held: bool = False
 ) -> Floats:
@@ -384,13 +374,13 @@ def sample(
     if callable(reference):
         try:
             given = [(partial(reference, t), shape, f" at t = {t:.6g} s") for t in points.t.tolist()]
-            return np.array([returned("the reference", *each) for each in given])
+            return _rotations(name, np.array([returned("the reference", *each) for each in given]))
         except InputError as error:
             raise CostError(name, str(error)) from error
     array = require_finite(f"{name} reference", as_floats(f"{name} reference", reference))
     steps, N = points.steps, points.steps + 1
     if array.shape in ((), shape):
-        return np.array(np.broadcast_to(array, (1, *shape)))
+        return _rotations(name, np.array(np.broadcast_to(array, (1, *shape))))
     if held and array.shape == (steps, *shape):
         step = np.floor(points.elapsed * (steps / points.duration) + TRACE).astype(np.int64)
         held_rows: Floats = array[np.minimum(step, steps - 1)]
@@ -403,6 +393,14 @@ def sample(
         )
     nodes = np.linspace(0.0, points.duration, N)
     if len(shape) == 2:
-        turns = scipy.spatial.transform.Slerp(nodes, scipy.spatial.transform.Rotation.from_matrix(array))
+        rotations = scipy.spatial.transform.Rotation.from_matrix(_rotations(name, array))
+        turns = scipy.spatial.transform.Slerp(nodes, rotations)
         return np.asarray(turns(np.clip(points.elapsed, 0.0, points.duration)).as_matrix())
     return np.column_stack([np.interp(points.elapsed, nodes, column) for column in array.T])
+
+
+def _rotations(name: str, values: Floats) -> Floats:
+    """Values of a reference; an InputError where they are matrices (N, 3, 3), and one is no rotation."""
+    for k, R in enumerate(values if values.ndim == 3 else ()):
+        rotation_matrix(f"{name} reference{f' number {k}' if len(values) > 1 else ''}", R)
+    return values

@@ -13,7 +13,6 @@ from varpin.control.costs.base import (
     LeastSquares,
     Points,
     ReferenceValues,
-    checked_reference,
     checked_weight,
     sample,
     weight_matrix,
@@ -22,7 +21,7 @@ from varpin.core import Subject
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
 from varpin.model.kinematics import require_same
-from varpin.support.checks import JointValues, control_array, joint_array, some_limits
+from varpin.support.checks import JointValues, as_floats, control_array, joint_array, some_limits
 
 
 class _Quadratic(LeastSquares):
@@ -34,11 +33,8 @@ class _Quadratic(LeastSquares):
     def __init__(self, reference: ReferenceValues | Mapping[str, float], weight: JointValues) -> None:
         name = type(self).__name__
         self.weight = weight if isinstance(weight, Mapping) else checked_weight(name, weight)
-        self.reference = reference if isinstance(reference, Mapping) else checked_reference(name, reference)
-
-    @property
-    def timed(self) -> bool:
-        return callable(self.reference) or (isinstance(self.reference, np.ndarray) and self.reference.ndim > 1)
+        given = isinstance(reference, Mapping) or callable(reference)
+        self.reference = reference if given else as_floats(f"{name} reference", reference)
 
     def bind(self, points: Points) -> BoundCost:
         name, of_controls = type(self).__name__, self._block == 2
@@ -108,7 +104,6 @@ class ControlCost(_Quadratic):
 class _Barrier(LeastSquares):
     weight: Floats
     limits: Floats
-    timed = False
     _block: int
 
     def __init__(

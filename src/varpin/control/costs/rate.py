@@ -79,11 +79,6 @@ class ControlRate(Frozen):
         shares: Floats = ((changes @ (self.weight / period)) * changes).sum(axis=-1)
         return shares
 
-    def value(self, u: Floats, period: float) -> Floats:
-        """The cost (...) of controls (..., N, m) that change every ``period`` [s]."""
-        total: Floats = self.shares(u, period).sum(axis=-1)
-        return total
-
     def expand(self, u: Floats, period: float) -> tuple[Floats, Floats]:
         """Gradients (N, m) and Hessians (N, m, m) in u_k of the cost of each change, at controls (N, m)."""
         hessian = np.tile(2.0 * self.weight / period, (len(u), 1, 1))
@@ -101,10 +96,7 @@ class ControlRate(Frozen):
 def control_rate(cost: Cost, controls: int, joints: Sequence[str] | None = None) -> ControlRate | None:
     """The sum of a cost's terms on the rate of m controls; None if there is none.
 
-    Args:
-        cost: The cost.
-        controls: m.
-        joints: The joint whose force each control is; None where controls are something else.
+    ``joints`` are those whose force each control is; None where controls are something else.
 
     Raises:
         UnknownJoint: A name that is no driven joint's.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,11 +10,9 @@ from numpy.typing import ArrayLike
 from varpin.arrays import Floats
 from varpin.control.costs.base import (
     BoundTerm,
-    CostError,
     LeastSquares,
     Points,
     ReferenceValues,
-    checked_reference,
     checked_weight,
     sample,
     weight_matrix,
@@ -23,44 +20,21 @@ from varpin.control.costs.base import (
 from varpin.core import Subject
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
-from varpin.model.kinematics import FrameKinematics, Links, frame_kinematics, mass_carriers, require_same
-from varpin.support.checks import positive, rotation_matrix, tuple_of
+from varpin.model.kinematics import frame_kinematics, mass_carriers, require_same
+from varpin.support.checks import as_floats, positive, tuple_of
 
 
 class _TaskCost(LeastSquares):
     """weight . r^2 with r what a ``subject`` of the core is beside a target."""
 
     robot: Robot
-    frame: str
     weight: Floats
     target: ReferenceValues
     subject = Subject.position
     shape: tuple[int, ...] = (3,)  # of a constant target
-    _of: FrameKinematics | Links
+    _of_all = False  # of all links, not of a frame
+    _directions = np.zeros(0, dtype=np.int64)  # rows of the Jacobian in a manipulability
 
-    def _take(self, robot: Robot, target: ReferenceValues, weight: ArrayLike) -> None:
-        name = type(self).__name__
-        self.robot = require_robot(robot, name)
-        self._of = self._place()
-        self.weight = checked_weight(name, weight)
-        weight_matrix(name, self.weight, self.shape[0])
-        self.target = checked_reference(name, target)
-
-    def _place(self) -> FrameKinematics | Links:
-        return frame_kinematics(self.robot, self.frame)
-
-    @property
-    def timed(self) -> bool:
-        return callable(self.target) or np.ndim(self.target) > len(self.shape)
-
-    def bind(self, points: Points) -> BoundTerm:
-        name = type(self).__name__
-        require_same(name, self.robot, points.robot)
-        target = sample(name, self.target, points, self.shape)
-        return BoundTerm(points, self.subject, self._of, weight_matrix(name, self.weight, self.shape[0]), target)
-
-
-class _FrameCost(_TaskCost):
     def __init__(self, robot: Robot, frame: str, target: ReferenceValues, weight: ArrayLike = 1.0) -> None:
         """Describe the cost.
 
@@ -71,18 +45,29 @@ class _FrameCost(_TaskCost):
                 problem's N + 1 nodes. Between nodes it is linear; rotations turn evenly.
             weight: One number, a vector or a matrix, positive semidefinite; zeros leave directions out.
         """
-        self.frame = frame
-        self._take(robot, target, weight)
+        name = type(self).__name__
+        self.robot, self.frame = require_robot(robot, name), frame
+        self._of = mass_carriers(robot) if self._of_all else frame_kinematics(robot, frame)
+        self.weight = checked_weight(name, weight)
+        weight_matrix(name, self.weight, self.shape[0])
+        self.target = target if callable(target) else as_floats(f"{name} reference", target)
+
+    def bind(self, points: Points) -> BoundTerm:
+        name = type(self).__name__
+        require_same(name, self.robot, points.robot)
+        target = sample(name, self.target, points, self.shape)
+        weight = weight_matrix(name, self.weight, self.shape[0])
+        return BoundTerm(points, self.subject, self._of, weight, target.reshape(len(target), -1), self._directions)
 
 
-class FramePositionCost(_FrameCost):
+class FramePositionCost(_TaskCost):
     """weight . (p(q) - p_r(t))^2: bring the origin of a frame to a place, or along a path.
 
     The target p_r is a place (3,) in the world [m], the weight one number, (3,) or (3, 3) [cost / m^2].
     """
 
 
-class FrameOrientationCost(_FrameCost):
+class FrameOrientationCost(_TaskCost):
     """weight . log(R_r(t)' R(q))^2: turn a frame.
 
     The target R_r is a rotation matrix (3, 3) from the frame's axes to the world's, the weight one number, (3,) or
@@ -93,28 +78,8 @@ class FrameOrientationCost(_FrameCost):
     subject = Subject.orientation
     shape = (3, 3)
 
-    def bind(self, points: Points) -> BoundTerm:
-        bound = super().bind(points)
-        try:
-            _require_rotations(bound.target)
-        except InputError as error:
-            if callable(self.target):
-                raise CostError("FrameOrientationCost", str(error)) from error
-            raise
-        return replace(bound, target=bound.target.reshape(-1, 9))
 
-    def _take(self, robot: Robot, target: ReferenceValues, weight: ArrayLike) -> None:
-        super()._take(robot, target, weight)
-        if isinstance(self.target, np.ndarray) and self.target.shape[-2:] == (3, 3):
-            _require_rotations(self.target.reshape(-1, 3, 3))
-
-
-def _require_rotations(target: Floats) -> None:
-    for k, R in enumerate(target):
-        rotation_matrix(f"FrameOrientationCost target{f' number {k}' if len(target) > 1 else ''}", R)
-
-
-class FrameVelocityCost(_FrameCost):
+class FrameVelocityCost(_TaskCost):
     """weight . (J(q) v - V_r(t))^2: the velocity of a frame's origin, and its angular velocity, in world axes.
 
     The target V_r is linear [m/s] over angular [rad/s] velocity (6,), the weight one number, (6,) or (6, 6).
@@ -131,16 +96,15 @@ class FrameVelocityCost(_FrameCost):
 class CenterOfMassCost(_TaskCost):
     """weight . (c(q) - c_r(t))^2 with c the centre of mass of the links that joints move."""
 
+    _of_all = True
+
     def __init__(self, robot: Robot, target: ReferenceValues, weight: ArrayLike = 1.0) -> None:
         """Describe the cost; see :class:`FramePositionCost`.
 
         Raises:
             InputError: The links have no mass, or a weight is no such weight.
         """
-        self._take(robot, target, weight)
-
-    def _place(self) -> Links:
-        return mass_carriers(self.robot)
+        super().__init__(robot, "", target, weight)
 
 
 _DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
@@ -176,8 +140,7 @@ class ManipulabilityCost(_TaskCost):
                 some of x, y, z, rx, ry, rz, in world axes.
         """
         self.least = positive("ManipulabilityCost least", least, "m or rad for each direction")
-        self.frame = frame
-        self._take(robot, self.least, weight)
+        super().__init__(robot, frame, self.least, weight)
         if self.weight.ndim:
             raise InputError(f"ManipulabilityCost weight must be one number, got shape {self.weight.shape}")
         names = _SETS.get(directions, ()) if isinstance(directions, str) else directions
@@ -191,7 +154,4 @@ class ManipulabilityCost(_TaskCost):
             raise InputError(
                 f"ManipulabilityCost: with {robot.dof} coordinates no frame moves freely in {len(chosen)} directions"
             )
-        self._rows = np.array([_DIRECTIONS.index(name) for name in chosen], dtype=np.int64)
-
-    def bind(self, points: Points) -> BoundTerm:
-        return replace(super().bind(points), directions=self._rows)
+        self._directions = np.array([_DIRECTIONS.index(name) for name in chosen], dtype=np.int64)

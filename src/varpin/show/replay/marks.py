@@ -268,8 +268,7 @@ def _regions(figure: Figure, constraints: Sequence[PlanConstraint], begin: float
         yield _solid("obstacle", body.name, body.points @ body.rotation.T, body.radius, body.position + shifts)
     for c in constraints:
         if isinstance(c, kinds.KeepInSphere | kinds.KeepOutOfSphere):
-            centers = c.shifts(times) if callable(c.center) else c.shifts(times)[:1]
-            yield _solid("out" if c.outside else "in", c.frame, np.zeros((1, 3)), c.radius, centers)
+            yield _solid("out" if c.outside else "in", c.frame, np.zeros((1, 3)), c.radius, c.centers(times))
         elif isinstance(c, kinds.KeepInBox):
             yield _open_box(figure, c.frame, c.limits, np.zeros(3), np.eye(3))
         elif isinstance(c, kinds.KeepInHalfSpace):
