@@ -20,10 +20,9 @@ from varpin.core import (
     constrained_derivatives,
     filter_variational,
 )
-from varpin.core.arrays import Commands, FilterArrays, FilterLog, RolloutArrays, new_nodes
+from varpin.core.arrays import Commands, FilterArrays, FilterLog, RolloutArrays
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
-    Compiled,
     Integrator,
     Run,
     Segment,
@@ -31,7 +30,6 @@ from varpin.integrators.base import (
     drifts,
     forces,
     gear,
-    segments_of,
     without_inputs,
     written,
 )
@@ -99,7 +97,7 @@ class Guard:
         return text if text.endswith(")") else f"{text}()"
 
 
-class Variational(Compiled):
+class Variational(Integrator):
     """A variational integrator on (q, p) with guarded steps and noise impulses."""
 
     guard: Guard | None
@@ -120,7 +118,6 @@ class Variational(Compiled):
         word("kick", self.kick, ("left", "split", "held"))
 
     def damped(self, z: Floats) -> tuple[Floats, Floats]:
-        """See :meth:`Integrator.damped`."""
         a, b, c = self._coefficients()
         stages = np.linalg.solve(np.eye(len(c)) + z[:, None, None] * a, np.stack([np.ones_like(c), c], axis=1))
         kept, held = (1.0 - z[:, None] * (b @ stages)).T
@@ -182,24 +179,18 @@ class Variational(Compiled):
         """
         return self._guards(energy=False) if trajectory.noisy else _core_guards(None)
 
-    def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[Run, list[Segment]]:
-        """See :meth:`Integrator.start`; p0 = M(q0) v0."""
-        if scene.custom is not None:
-            scene.custom.check(q0, v0)
-        run = self.begun(scene, q0, v0)
-        nodes = new_nodes(len(q0), 1, scene.robot.dof, scene.controls)
-        nodes.q[:, 0], nodes.p[:, 0], nodes.v[:, 0], nodes.energy[:, 0] = run.paths.nodes()
-        nodes.done[:] = 1
-        return run, segments_of(nodes, REASONS)
-
     def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
-        """See :meth:`Compiled.begun`."""
         guards, places = self._guards(energy=not scene.inputs), self._places(scene) if scene.constraints else None
         method = scene.core, self._tableau(), float(self.tolerance), guards, self.left
         rollout = Rollout(*method, len(q0), self.holds_noise, places)
         if not rollout.begin(q0, v0):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
         return Run(rollout, q0.copy(), bool(scene.inputs))
+
+    def _first(self, run: Run, nodes: RolloutArrays) -> bool:
+        nodes.q[:, 0], nodes.p[:, 0], nodes.v[:, 0], nodes.energy[:, 0] = run.paths.nodes()
+        nodes.done[:] = 1
+        return True
 
     def fork(self, state: Run) -> Run:
         return replace(state, paths=state.paths.fork(self._guards(energy=not state.driven)))
@@ -210,7 +201,7 @@ class Variational(Compiled):
             return found
         return [_constrained(scene, paths, i, segment) for i, segment in enumerate(found)]
 
-    def state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
+    def _state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
         q, p, v, _ = state.paths.nodes()
         return q[0], p[0], v[0]
 
@@ -234,7 +225,6 @@ class Variational(Compiled):
         return Jx, Jf, self._kicks(scene, trajectory, Jx, Jf), Jr if ramp else 0.5 * Jf
 
     def in_parameters(self, scene: Scene, trajectory: Trajectory, varied: Sequence[Varied]) -> Floats:
-        """See :meth:`Integrator.in_parameters`."""
         pairs = [(each.above.core, each.below.core) for each in varied]
         gears = np.array([[gear(scene, each.above), gear(scene, each.below)] for each in varied])
         distance = np.array([each.distance for each in varied])
