@@ -10,9 +10,8 @@ from typing import Any
 
 from varpin.errors import InputError
 from varpin.integrators.base import Integrator
-from varpin.integrators.collocation import Gauss, Radau
+from varpin.integrators.collocation import Gauss, Midpoint, Radau
 from varpin.integrators.explicit import ExplicitEuler, RungeKutta4, SemiImplicitEuler
-from varpin.integrators.midpoint import Midpoint
 from varpin.integrators.reference import Reference
 from varpin.integrators.variational import Guard
 from varpin.mechanics.scene import Scene, differences, same

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from varpin.core import (
     Parameters,
     Rollout,
     Steps,
-    Tableau,
     constrained_derivatives,
     filter_variational,
 )
@@ -33,6 +32,7 @@ from varpin.integrators.base import (
     without_inputs,
     written,
 )
+from varpin.integrators.tableau import Scheme
 from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.signals.commands import cubics
@@ -105,6 +105,13 @@ class Variational(Integrator):
 
     variational = True
     reasons = REASONS
+    # Factors of the guard's energy balance and energy budget, of methods with more than one stage.
+    shares: ClassVar[tuple[float, float]] = (1.0, 1.0)
+
+    @property
+    @abstractmethod
+    def scheme(self) -> Scheme:
+        """The points and coefficients of the method."""
 
     def same_map(self, other: Integrator) -> bool:
         """See :meth:`Integrator.same_map`; guards and tolerances do not change the map of an undivided step."""
@@ -118,34 +125,27 @@ class Variational(Integrator):
         word("kick", self.kick, ("left", "split", "held"))
 
     def damped(self, z: Floats) -> tuple[Floats, Floats]:
-        a, b, c = self._coefficients()
+        _, a, b, c, *_ = self.scheme
         stages = np.linalg.solve(np.eye(len(c)) + z[:, None, None] * a, np.stack([np.ones_like(c), c], axis=1))
         kept, held = (1.0 - z[:, None] * (b @ stages)).T
         return kept, held if self.holds_noise else self.left * kept + (1.0 - self.left)
 
     @property
     def keeps_constraints(self) -> bool:
-        return self._constraint_places() is not None
+        return self.scheme.places is not None
 
-    @abstractmethod
-    def _coefficients(self) -> tuple[Floats, Floats, Floats]:
-        """A (s, s), b (s,) and c (s,) over a unit step, by which forces act."""
-
-    @abstractmethod
-    def _tableau(self) -> Tableau:
-        """The coefficients of the method."""
-
-    def _constraint_places(self) -> Floats | None:
-        """:func:`lobatto_places` of the points where constraints hold; None for methods without constraints."""
-        return None
+    @property
+    def stage_times(self) -> tuple[float, ...]:
+        times: list[float] = self.scheme.times.tolist()
+        return tuple(times) if len(times) > 1 else ()
 
     def _places(self, scene: Scene) -> Floats:
-        """:meth:`_constraint_places`, checked for a scene with constraints.
+        """The points where constraints hold, checked for a scene with constraints.
 
         Raises:
             InputError: The method takes no constraints, or the scene has noise that does not go with them.
         """
-        places = self._constraint_places()
+        places = self.scheme.places
         if places is None:
             refuse_constraints(scene, self)
             raise InputError(f"{self} keeps no constraints")
@@ -161,14 +161,10 @@ class Variational(Integrator):
             raise InputError("noise whose fields depend on the velocity does not go with constraints")
         return places
 
-    def _shares(self) -> tuple[float, float]:
-        """Factors of the guard's energy balance and energy budget."""
-        return 1.0, 1.0
-
     def _guards(self, *, energy: bool = True) -> Guards:
         """Guards of the core. Without ``energy`` the balance is not checked: kinematic inputs exchange energy."""
         if self.guard is None or energy:
-            return _core_guards(self.guard, *self._shares())
+            return _core_guards(self.guard, *(self.shares if len(self.scheme.times) > 1 else (1.0, 1.0)))
         return _core_guards(replace(self.guard, energy_balance=_UNCHECKED, energy_budget=_UNCHECKED))
 
     def _guards_again(self, trajectory: Trajectory) -> Guards:
@@ -181,7 +177,7 @@ class Variational(Integrator):
 
     def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
         guards, places = self._guards(energy=not scene.inputs), self._places(scene) if scene.constraints else None
-        method = scene.core, self._tableau(), float(self.tolerance), guards, self.left
+        method = scene.core, self.scheme.tableau, float(self.tolerance), guards, self.left
         rollout = Rollout(*method, len(q0), self.holds_noise, places)
         if not rollout.begin(q0, v0):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
@@ -324,7 +320,7 @@ class Variational(Integrator):
     def filtered(self, scene: Scene, log: FilterLog) -> FilterArrays:
         """See :meth:`Integrator.filtered`; the state is (q, p)."""
         guards = _core_guards(replace(self.guard or Guard(), energy_balance=_UNCHECKED, energy_budget=_UNCHECKED))
-        found = filter_variational(scene.core, self._tableau(), float(self.tolerance), guards, log)
+        found = filter_variational(scene.core, self.scheme.tableau, float(self.tolerance), guards, log)
         return self._reached(found, log, REASONS)
 
     def _steps(self, scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
@@ -342,7 +338,7 @@ class Variational(Integrator):
         }
         return {
             "mechanism": scene.core,
-            "tableau": self._tableau(),
+            "tableau": self.scheme.tableau,
             "tolerance": float(self.tolerance),
             "guards": self._guards_again(trajectory),
             "dt": float(trajectory.dt),
@@ -351,7 +347,7 @@ class Variational(Integrator):
 
     def _guess(self, trajectory: Trajectory) -> Floats:
         """Stage velocities (N, s, n) at dw = 0 from the cubic through both nodes; with noise, those at the starts."""
-        v, moved, times = trajectory.v, np.diff(trajectory.q, axis=0), self._times()
+        v, moved, times = trajectory.v, np.diff(trajectory.q, axis=0), self.scheme.times
         if trajectory.noisy:
             return np.repeat(v[:-1, None], len(times), axis=1)
         if len(times) == 1:
@@ -359,10 +355,6 @@ class Variational(Integrator):
         along = cubics(times, trajectory.dt)[:, 5:]
         guess: Floats = np.einsum("se,kne->ksn", along, np.stack([v[:-1], moved, v[1:]], axis=2))
         return guess
-
-    @abstractmethod
-    def _times(self) -> Floats:
-        """Times of the stages in a unit step (s,)."""
 
 
 def _constrained(scene: Scene, paths: Rollout, i: int, segment: Segment) -> Segment:
