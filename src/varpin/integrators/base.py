@@ -15,7 +15,6 @@ import numpy as np
 from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands, FilterArrays, FilterLog, RolloutArrays, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
-from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.noise import Fields, over_steps
 from varpin.mechanics.scene import Scene
 from varpin.signals.commands import (
@@ -292,15 +291,24 @@ class Integrator(ABC):
         self, scene: Scene, state: Run, now: Commands, ends: tuple[Floats, Floats], drawn: Floats | None, dt: float
     ) -> Segment:
         """One step of one path with fields in Python, between controls ``ends`` (1, m), with increments ``drawn``."""
-        q, _, v = self._state_of(state)
-        start = state.start[0]
-        F, drift = diffusion_and_drift(scene, q, v, now.u[0], start, ends)
-        impulse = None if drawn is None else noise_of_step(scene, F, q, v, ends, start, drawn)
-        segment = self.kicked(scene, state, now, self.drift_share * drift, impulse, dt)
-        if drawn is not None and self.left < 1.0 and segment.failure is None:
+        start, k = state.start[0], scene.processes
+        sloped = drawn is not None and drawn.size > k
+        around = ends if sloped or scene.noise.velocity_dependent else None
+
+        def noise() -> tuple[Floats | None, Floats]:
+            """The impulse of the increments at the state of the path, and the drift."""
             q, _, v = self._state_of(state)
-            F, _ = diffusion_and_drift(scene, q, v, now.u[0], start)
-            state.paths.kick((1.0 - self.left) * noise_of_step(scene, F, q, v, ends, start, drawn)[None])
+            F, drift = diffusion_and_drift(scene, q, v, now.u[0], start, around)
+            if drawn is None:
+                return None, drift
+            impulse = F[:, :k] @ drawn[:k]
+            return impulse + F[:, k:] @ drawn[k:] if sloped else impulse, drift
+
+        impulse, drift = noise()
+        segment = self.kicked(scene, state, now, self.drift_share * drift, impulse, dt)
+        if impulse is not None and self.left < 1.0 and segment.failure is None:
+            impulse, _ = noise()
+            state.paths.kick((1.0 - self.left) * np.array([impulse]))
             _, segment.p[-1:], segment.v[-1:], segment.energy[-1:] = state.paths.nodes()
         return segment
 
@@ -404,52 +412,32 @@ def join(segments: Sequence[Segment]) -> Segment:
 def diffusion_and_drift(
     scene: Scene, q: Floats, v: Floats, u: Floats, start: Floats, ends: tuple[Floats, Floats] | None = None
 ) -> tuple[Floats, Floats]:
-    """Diffusion fields F (n, k) at one state, and the Ito correction: the drift (n,) from Stratonovich to Ito.
+    """Diffusion fields F (n, K) at one state, and the Ito correction: the drift (n,) from Stratonovich to Ito.
 
-    The drift is (1/2) sum_i (dF_i/dv) M^-1 F_i [N m or N], equation (N1) and (1.3) of the paper; it is zero if no field
-    depends on the velocity. Of controls that are linear over a step between ``ends`` (1, m) it is the mean drift.
+    Of controls that are linear over a step between ``ends`` (1, m) the drift is the mean.
     """
-    diffusion = over_steps(
-        scene.noise, q[None], v[None], u[None], ends if scene.noise.velocity_dependent else None, start
-    )
-    F, k = diffusion.F[0], scene.processes
-    if diffusion.Fv is None:
-        return F[:, :k], np.zeros_like(q)
-    M = lagrangian_jet(scene, q, v).Lvv
-    return F[:, :k], 0.5 * np.einsum("ikj,jk->i", diffusion.Fv[0], np.linalg.solve(M, F))
+    found = over_steps(scene.noise, q[None], v[None], u[None], ends, start)
+    return found.F[0], _drift(scene, q[None], v[None], found)[0]
 
 
-def noise_of_step(
-    scene: Scene, F: Floats, q: Floats, v: Floats, ends: tuple[Floats, Floats], start: Floats, dw: Floats
-) -> Floats:
-    """The impulse (n,) of increments dw (K,) at a state, by fields in Python: F (n, k) of the mean.
+def _drift(scene: Scene, q: Floats, v: Floats, fields: Fields) -> Floats:
+    """The drift (N, n) from Stratonovich to Ito, (1/2) sum_i (dF_i/dv) M^-1 F_i [N m or N], at (q, v) (N, n).
 
-    ``ends`` (1, m) are the controls at both ends of the step, ``start`` (n,) is the first configuration of the motion.
+    Equation (N1), and (1.3) of the paper; it is zero if no field depends on the velocity.
     """
-    k = scene.processes
-    impulse: Floats = F @ dw[:k]
-    if dw.size > k:
-        impulse = impulse + over_steps(scene.noise, q[None], v[None], ends[0], ends, start).F[0, :, k:] @ dw[k:]
-    return impulse
+    if fields.Fv is None:
+        return np.zeros_like(q)
+    M, _ = scene.core.jets(np.ascontiguousarray(q), np.ascontiguousarray(v))
+    drift: Floats = 0.5 * np.einsum("Nikj,Njk->Ni", fields.Fv, np.linalg.solve(M, fields.F))
+    return drift
 
 
 def drifts(scene: Scene, trajectory: Trajectory) -> Floats | float:
     """The drift of :func:`diffusion_and_drift` at the start of every step (N, n), or 0 where none has any."""
     if not scene.noise.velocity_dependent:
         return 0.0
-    nodes = zip(trajectory.q[:-1], trajectory.v[:-1], trajectory.u, strict=True)
-    return np.array(
-        [
-            diffusion_and_drift(scene, q, v, u, trajectory.q[0], ends_at(trajectory, k))[1]
-            for k, (q, v, u) in enumerate(nodes)
-        ]
-    )
-
-
-def ends_at(trajectory: Trajectory, k: int) -> tuple[Floats, Floats] | None:
-    """The controls (1, m) at both ends of step k where they are linear between nodes; else None."""
-    nodes = trajectory.u_nodes
-    return (nodes[k : k + 1], nodes[k + 1 : k + 2]) if nodes.shape[1] else None
+    q, v = trajectory.q[:-1], trajectory.v[:-1]
+    return _drift(scene, q, v, noise_fields(scene, trajectory, q, v, trajectory.q[0]))
 
 
 def noise_fields(
