@@ -14,7 +14,8 @@ from varpin.integrators.collocation import Gauss, Midpoint, Radau
 from varpin.integrators.explicit import ExplicitEuler, RungeKutta4, SemiImplicitEuler
 from varpin.integrators.reference import Reference
 from varpin.integrators.variational import Guard
-from varpin.mechanics.scene import Scene, differences, same
+from varpin.mechanics.scene import Scene
+from varpin.mechanics.values import differences, same
 from varpin.trajectory import Trajectory, require_trajectory
 
 _OWN: tuple[type[Integrator], ...] = (Midpoint, Gauss, Radau, ExplicitEuler, SemiImplicitEuler, RungeKutta4, Reference)

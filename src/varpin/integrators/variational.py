@@ -161,22 +161,24 @@ class Variational(Integrator):
             raise InputError("noise whose fields depend on the velocity does not go with constraints")
         return places
 
-    def _guards(self, *, energy: bool = True) -> Guards:
-        """Guards of the core. Without ``energy`` the balance is not checked: kinematic inputs exchange energy."""
-        if self.guard is None or energy:
-            return _core_guards(self.guard, *(self.shares if len(self.scheme.times) > 1 else (1.0, 1.0)))
-        return _core_guards(replace(self.guard, energy_balance=_UNCHECKED, energy_budget=_UNCHECKED))
+    def guards(self, guard: Guard | None, *, energy: bool = True) -> Guards:
+        """A guard for the core; None accepts every root.
 
-    def _guards_again(self, trajectory: Trajectory) -> Guards:
-        """Guards for repeating the steps of a trajectory at dw = 0.
-
-        Without noise the steps are the same, and there is nothing to check. Otherwise the steps differ by the noise
-        impulses, and their roots must lie on the branch that is connected to dt -> 0.
+        Without ``energy`` the balance is not checked: kinematic inputs exchange energy.
         """
-        return self._guards(energy=False) if trajectory.noisy else _core_guards(None)
+        given = guard or Guard(max_halvings=0)
+        balance, budget = self.shares if len(self.scheme.times) > 1 else (1.0, 1.0)
+        return Guards.make(
+            active=guard is not None,
+            branch_margin=float(given.branch_margin),
+            energy_balance=balance * float(given.energy_balance) if energy else _UNCHECKED,
+            energy_budget=budget * float(given.energy_budget) if energy else _UNCHECKED,
+            most_halvings=int(given.max_halvings),
+        )
 
     def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
-        guards, places = self._guards(energy=not scene.inputs), self._places(scene) if scene.constraints else None
+        guards = self.guards(self.guard, energy=not scene.inputs)
+        places = self._places(scene) if scene.constraints else None
         method = scene.core, self.scheme.tableau, float(self.tolerance), guards, self.left
         rollout = Rollout(*method, len(q0), self.holds_noise, places)
         if not rollout.begin(q0, v0):
@@ -189,7 +191,7 @@ class Variational(Integrator):
         return True
 
     def fork(self, state: Run) -> Run:
-        return replace(state, paths=state.paths.fork(self._guards(energy=not state.driven)))
+        return replace(state, paths=state.paths.fork(self.guards(self.guard, energy=not state.driven)))
 
     def _segments(self, scene: Scene, paths: Any, nodes: RolloutArrays) -> list[Segment]:
         found = super()._segments(scene, paths, nodes)
@@ -319,7 +321,7 @@ class Variational(Integrator):
 
     def filtered(self, scene: Scene, log: FilterLog) -> FilterArrays:
         """See :meth:`Integrator.filtered`; the state is (q, p)."""
-        guards = _core_guards(replace(self.guard or Guard(), energy_balance=_UNCHECKED, energy_budget=_UNCHECKED))
+        guards = self.guards(self.guard or Guard(), energy=False)
         found = filter_variational(scene.core, self.scheme.tableau, float(self.tolerance), guards, log)
         return self._reached(found, log, REASONS)
 
@@ -340,7 +342,9 @@ class Variational(Integrator):
             "mechanism": scene.core,
             "tableau": self.scheme.tableau,
             "tolerance": float(self.tolerance),
-            "guards": self._guards_again(trajectory),
+            # Without noise the steps are the same, and there is nothing to check. Otherwise they differ by the noise
+            # impulses, and their roots must lie on the branch that is connected to dt -> 0.
+            "guards": self.guards(self.guard if trajectory.noisy else None, energy=False),
             "dt": float(trajectory.dt),
             **{name: np.ascontiguousarray(array) for name, array in arrays.items()},
         }
@@ -383,17 +387,6 @@ def _along(scene: Scene, q: Floats) -> Floats:
         0, 2, 1
     )
     return found
-
-
-def _core_guards(given: Guard | None, balance: float = 1.0, budget: float = 1.0) -> Guards:
-    guard = given or Guard(max_halvings=0)
-    return Guards.make(
-        active=given is not None,
-        branch_margin=float(guard.branch_margin),
-        energy_balance=balance * float(guard.energy_balance),
-        energy_budget=budget * float(guard.energy_budget),
-        most_halvings=int(guard.max_halvings),
-    )
 
 
 def _require_solved(trajectory: Trajectory, outcome: int, done: int) -> None:

@@ -76,6 +76,8 @@ class Kind(NamedTuple):
 # Armature is an element of a scene, and part of the tree in the core.
 ELEMENTS = {"Armature": Kind(1, False, False)} | {name: Kind(*facts) for name, facts in element_kinds().items()}
 COUPLINGS = {name: Kind(*facts) for name, facts in coupling_kinds().items()}
+# Kinds of elements whose sums by joint are attributes of a scene.
+SUMMED = ("Armature", "JointDamper", "JointSpring")
 
 
 def bound_force(force: Force, robot: Robot) -> tuple[Element | Coupling, ...]:
