@@ -113,11 +113,6 @@ class Variational(Integrator):
     def scheme(self) -> Scheme:
         """The points and coefficients of the method."""
 
-    def same_map(self, other: Integrator) -> bool:
-        """See :meth:`Integrator.same_map`; guards and tolerances do not change the map of an undivided step."""
-        mine, others = ({k: v for k, v in vars(x).items() if k not in ("guard", "tolerance")} for x in (self, other))
-        return type(self) is type(other) and mine == others
-
     def __post_init__(self) -> None:
         if not (self.guard is None or isinstance(self.guard, Guard)):
             raise InputError(f"guard must be a varpin.Guard, or None for no guards, got {self.guard!r}")
