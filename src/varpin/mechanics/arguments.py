@@ -91,18 +91,19 @@ def acting_forces(
     given: tuple[Force, ...] = tuple_of("forces", forces, Force)
     kinds = {type(force) for force in given}
 
-    def resistance(name: str, value: Any, own: Floats, *, decided: bool) -> Floats:
+    def resistance(name: str, value: Any, own: Floats, *, decided: bool) -> JointValues:
         asked = isinstance(value, str)
         if asked and value != "robot":
             raise InputError(f"{name} must be numbers, or 'robot' for those of the robot's description, got {value!r}")
         _warn_of_description(robot, name, name, gives=bool(own.any()), asked=asked, decided=decided)
-        values = own if asked else 0.0 if value is None else value
-        return joint_array(name, values, robot.joint_names, uniform=True)
+        given: JointValues = own if asked else 0.0 if value is None else value
+        return given
 
     viscous = resistance("damping", damping, robot.damping, decided=damping is not None or JointDamper in kinds)
     # Numbers for the damping are a decision on the dry friction, too.
     decided = friction is not None or not (damping is None or is_one_of(damping, ("robot",)))
-    dry = resistance("friction", friction, robot.friction, decided=decided or CoulombFriction in kinds)
+    level = resistance("friction", friction, robot.friction, decided=decided or CoulombFriction in kinds)
+    dry = joint_array("friction", level, robot.joint_names, uniform=True)
     # Its force would call it the level.
     refuse_where("friction", dry, dry < 0.0, "must be >= 0")
     short: tuple[Force, ...] = (JointSpring(stiffness, rest), JointDamper(viscous), CoulombFriction(dry))
