@@ -337,11 +337,9 @@ class Quarter(Collocation):
     def order(self):
         return 1
 
-    def _tableau(self):
+    @property
+    def scheme(self):
         return midpoint(0.25)
-
-    def _coefficients(self):
-        return np.full((1, 1), 0.25), np.ones(1), np.full(1, 0.5)
 
 
 def test_an_integrator_is_a_tableau_and_a_name(monkeypatch):

@@ -221,7 +221,7 @@ def pair(robot, *, noise=None, fields=textbook.no_noise, gravity=(0.0, 0.0, -9.8
     model = robot.model.copy()
     model.gravity = pin.Motion(np.array(gravity), np.zeros(3))
     scene = vp.Scene(robot, gravity=gravity, noise=noise, **surroundings)
-    return scene, textbook.system(model, fields=fields, **surroundings)
+    return scene, textbook.System(model, fields=fields, **surroundings)
 
 
 @pytest.fixture(scope="module", params=["finger", "ur5", "chain"])
@@ -306,7 +306,7 @@ def test_models_of_joints_with_two_variables_are_refused():
     model = pin.Model()
     model.addJoint(0, pin.JointModelRUBZ(), pin.SE3.Identity(), "continuous")
     with refused(vp.InputError, "variable"):
-        textbook.system(model)
+        textbook.System(model)
 
 
 # --- sines, exponentials and tangents of the core: right to rounding, with and without FMA ---------------------------

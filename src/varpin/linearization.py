@@ -147,7 +147,9 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     within = trajectory.u_stages.shape[1] > 0 or trajectory.u_nodes.shape[1] > 0
     found = linearize_steps(scene, trajectory, integrator, trajectory.q[0], ramps=within)
     if not integrator.variational:
-        found = replace(found, K=_kick_columns(scene, trajectory, found.J))
+        # From a jump of the velocity to one of the momentum.
+        M, _ = node_jets(scene, trajectory.q[:-1], trajectory.v[:-1])
+        found = replace(found, K=found.J @ np.linalg.inv(M))
     return replace(found, warnings=wrong_spread(scene, integrator, trajectory), constrained=bool(scene.constraints))
 
 
@@ -271,13 +273,6 @@ def second_order_steps(scene: Scene, trajectory: Trajectory, z: Floats, integrat
     B = scene.transmission
     x, f = slice(0, 2 * n), slice(2 * n, 2 * n + len(B))
     return Curvature(xx=H[:, x, x], ux=B.T @ H[:, f, x], uu=B.T @ H[:, f, f] @ B)
-
-
-def _kick_columns(scene: Scene, trajectory: Trajectory, Jk: Floats) -> Floats:
-    """Derivatives of (q, v) in a jump of the momentum, from those in a jump of the velocity."""
-    M, _ = node_jets(scene, trajectory.q[:-1], trajectory.v[:-1])
-    columns: Floats = Jk @ np.linalg.inv(M)
-    return columns
 
 
 def node_jets(scene: Scene, q: Floats, v: Floats) -> tuple[Floats, Floats]:

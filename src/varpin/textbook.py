@@ -78,52 +78,43 @@ def state_noise(C: float, center: Floats) -> Fields:
     return fields
 
 
-@dataclass(frozen=True, eq=False)
 class System:
     """An arm and the forces on it, of which (1.1) is the equation of motion.
 
-    Attributes:
+    Args:
         model: Pinocchio model, with its gravity. Every joint has one configuration and one velocity variable, in the
             same order; the rest of varpin treats mimic joints and continuous joints, which have two in Pinocchio.
-        actuation: B (n, m), generalized force per unit of control.
-        damping: Viscous damping (n,) [N m s/rad or N s/m]; the force is F_c = B u - damping v.
-        stiffness: Stiffness of joint springs (n,) [N m/rad or N/m].
-        rest: Rest configuration of the springs (n,) [rad or m].
+        actuation: B (n, m), generalized force per unit of control; every joint is driven if left out.
+        damping: Viscous damping, (n,) or one number [N m s/rad or N s/m]; the force is F_c = B u - damping v.
+        stiffness: Stiffness of joint springs, (n,) or one number [N m/rad or N/m].
+        rest: Rest configuration of the springs, (n,) or one number.
         fields: The diffusion fields: a function of (q, u) that returns F (n, k), one column for each Wiener process,
             dF/dq (n, k, n) and dF/du (n, k, m).
-    """
-
-    model: pin.Model
-    actuation: Floats
-    damping: Floats
-    stiffness: Floats
-    rest: Floats
-    fields: Fields = no_noise
-
-
-def system(
-    model: pin.Model,
-    *,
-    actuation: Floats | None = None,
-    damping: Floats | float = 0.0,
-    stiffness: Floats | float = 0.0,
-    rest: Floats | float = 0.0,
-    fields: Fields = no_noise,
-) -> System:
-    """A :class:`System`. One number applies to all joints; every joint is driven if ``actuation`` is left out.
 
     Raises:
         InputError: A joint of the model has more than one variable.
     """
-    n = model.nv
-    if model.nq != n or any(joint.nv != 1 for joint in list(model.joints)[1:]):
-        raise InputError("every joint must have one variable; varpin.load_robot takes continuous and mimic joints, too")
 
-    def per_joint(value: Floats | float) -> Floats:
-        return np.broadcast_to(np.asarray(value, dtype=np.float64), (n,))
-
-    driven = np.eye(n) if actuation is None else actuation
-    return System(model, driven, per_joint(damping), per_joint(stiffness), per_joint(rest), fields)
+    def __init__(
+        self,
+        model: pin.Model,
+        *,
+        actuation: Floats | None = None,
+        damping: Floats | float = 0.0,
+        stiffness: Floats | float = 0.0,
+        rest: Floats | float = 0.0,
+        fields: Fields = no_noise,
+    ) -> None:
+        n = model.nv
+        if model.nq != n or any(joint.nv != 1 for joint in list(model.joints)[1:]):
+            raise InputError(
+                "every joint must have one variable; varpin.load_robot takes continuous and mimic joints, too"
+            )
+        self.model, self.fields = model, fields
+        self.actuation = np.eye(n) if actuation is None else actuation
+        self.damping, self.stiffness, self.rest = (
+            np.broadcast_to(np.asarray(value, dtype=np.float64), (n,)) for value in (damping, stiffness, rest)
+        )
 
 
 # --- the Lagrangian --------------------------------------------------------------------------------------------------

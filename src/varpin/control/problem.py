@@ -32,7 +32,8 @@ from varpin.finding import announce
 from varpin.integrators import Integrator
 from varpin.integrators.registry import require_motion
 from varpin.mechanics.lagrangian import lagrangian_jet
-from varpin.mechanics.scene import Scene, closest_controls, require_scene, same, tangent_basis
+from varpin.mechanics.scene import Scene, closest_controls, require_scene, tangent_basis
+from varpin.mechanics.values import same
 from varpin.signals.commands import as_moved, cubics
 from varpin.signals.policy import LinearPolicy, OpenLoop
 from varpin.simulation.choice import given_integrator, integrator_for

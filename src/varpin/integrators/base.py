@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -15,7 +15,6 @@ import numpy as np
 from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands, FilterArrays, FilterLog, RolloutArrays, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
-from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.noise import Fields, over_steps
 from varpin.mechanics.scene import Scene
 from varpin.signals.commands import (
@@ -82,19 +81,30 @@ class Varied(NamedTuple):
     distance: float  # between their values
 
 
+@dataclass(frozen=True)
+class Run:
+    """State of a rollout."""
+
+    paths: Any  # with a method ``roll``, as those of the core; it holds their work arrays
+    start: Floats  # initial configurations (P, n) [rad or m]
+    driven: bool = False  # whether the scene has kinematic inputs
+
+
 class Integrator(ABC):
     """A one-step method.
 
     A subclass provides
 
-    1. ``start``, which returns the state of a rollout at (q0, v0) and the first node, and ``fork``, which copies a
-       state;
-    2. ``rollout_compiled``, which advances a state by many steps of many paths in the core;
-    3. ``linearize``, the derivatives of its steps, and ``quiet_ends`` if it applies noise after a step too;
-    4. ``variational``, True if it maps (q, p) and False if it maps (q, v), and ``order``.
+    1. ``begun``, the paths of a rollout at (q0, v0), and ``fork``, which copies them;
+    2. ``linearize``, the derivatives of its steps, and ``quiet_ends`` if it applies noise after a step too;
+    3. ``variational``, True if it maps (q, p) and False if it maps (q, v), ``order``, and ``reasons``.
+
+    Its paths advance by ``roll``, whose arguments are those of the core's paths.
     """
 
     variational: bool
+    # Texts of the outcomes that end a rollout.
+    reasons: ClassVar[Mapping[int, str]]
     # Whether fast damped modes are at rest after one step.
     l_stable: ClassVar[bool] = False
     # When the noise impulse of a step acts, see :class:`Midpoint`.
@@ -112,8 +122,9 @@ class Integrator(ABC):
         return written(self, self.named)
 
     def same_map(self, other: Integrator) -> bool:
-        """Whether ``other`` has the same step map for undivided steps."""
-        return str(self) == str(other)
+        """Whether ``other`` has the same step map for undivided steps, whatever its guard and tolerance."""
+        mine, others = ({k: v for k, v in vars(x).items() if k not in ("guard", "tolerance")} for x in (self, other))
+        return type(self) is type(other) and mine == others
 
     @property
     @abstractmethod
@@ -155,32 +166,70 @@ class Integrator(ABC):
         """What a step leaves of velocities whose damping has rates z (k,) in units of 1 / dt, and of noise impulses."""
         return np.exp(-z), np.exp(-z)
 
-    @abstractmethod
-    def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[Any, list[Segment]]:
+    def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[Run, list[Segment]]:
         """The state of a rollout of P paths at (q0, v0), each (P, n), and a segment of the first node of each.
 
         Raises:
             SingularMassMatrix: M(q0) is not positive definite.
         """
+        run, nodes = self.begun(scene, q0, v0), new_nodes(len(q0), 1, scene.robot.dof, scene.controls)
+        if scene.custom is not None:
+            scene.custom.check(q0, v0)
+        if not self._first(run, nodes):
+            raise SingularMassMatrix(scene.robot.joint_names, q0)
+        return run, segments_of(nodes, self.reasons)
 
     @abstractmethod
-    def fork(self, state: Any) -> Any:
-        """An independent copy of a state, with this integrator's guard and shared work arrays."""
+    def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
+        """The state of a rollout of P paths at (q0, v0), each (P, n).
 
-    def rollout(self, scene: Scene, state: Any, commands: Commands, increments: Floats, dt: float) -> list[Segment]:
+        Raises:
+            InputError: The method does not take the scene.
+            SingularMassMatrix: As :meth:`start`, at the latest there.
+        """
+
+    def _first(self, run: Run, nodes: RolloutArrays) -> bool:
+        """Write the first node of each path; False if a mass matrix is not positive definite."""
+        return bool(run.paths.first_nodes(nodes))
+
+    def fork(self, state: Run) -> Run:
+        """An independent copy of a state, with this integrator's guard and shared work arrays."""
+        return replace(state, paths=state.paths.copy())
+
+    def _state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
+        """The q, p and v (n,) of the only path; p is empty for integrators on (q, v)."""
+        return state.paths.q[0], state.paths.q[0, :0], state.paths.v[0]
+
+    def rollout(self, scene: Scene, state: Run, commands: Commands, increments: Floats, dt: float) -> list[Segment]:
         """Advance ``state`` by the N steps of ``commands``, each of length ``dt`` [s].
 
         ``increments`` are the Wiener increments (P, N, k) [s^0.5], or (0, 0, k) for none; (P, N, K), those of slopes
         included (:meth:`Scene.increments`), for controls that are linear between nodes. Returns a segment for each
         path; with diffusion fields that only Python can evaluate there is one path.
         """
-        return self.rollout_compiled(scene, state, contiguous(commands), increments, scene.no_drift, dt)
+        if scene.noise.diffusion is not None:
+            return self.rollout_compiled(scene, state, contiguous(commands), increments, scene.no_drift, dt)
+        segments: list[Segment] = []
+        hold, before = commands.hold, commands.before
+        for j in range(steps_of(commands) // hold):
+            q, p, v = self._state_of(state)
+            decided = control_of(commands, j, np.concatenate([q, p if self.variational else v]), before)
+            row = rows(commands, j, j + 1, before)
+            now, begins, ends = self._controls(scene, row, np.tile(decided, (hold, 1)), q, v, dt)
+            for k in range(hold):
+                drawn = increments[0, j * hold + k] if len(increments) else None
+                around = begins[k : k + 1], ends[k : k + 1]
+                segments.append(self._step_in_python(scene, state, rows(now, k, k + 1), around, drawn, dt))
+                segments[-1].u[:] = decided
+                if segments[-1].failure is not None:
+                    return [join(segments)]
+            before = decided[None]
+        return [join(segments)]
 
-    @abstractmethod
     def rollout_compiled(
         self,
         scene: Scene,
-        state: Any,
+        state: Run,
         commands: Commands,
         increments: Floats,
         drift: Floats,
@@ -192,6 +241,13 @@ class Integrator(ABC):
         ``impulses`` (P, N, 2, n) are added to the momenta before and after each step, but not under constraints; an
         integrator that holds the noise spreads them over the step.
         """
+        nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
+        state.paths.roll(dt, commands, increments, drift, nodes, impulses=impulses)
+        return self._segments(scene, state.paths, nodes)
+
+    def _segments(self, scene: Scene, paths: Any, nodes: RolloutArrays) -> list[Segment]:  # noqa: ARG002
+        """A segment for each of the paths, which have written ``nodes``."""
+        return segments_of(nodes, self.reasons, paths)
 
     def motions(
         self, scene: Scene, q0: Floats, v0: Floats, commands: Commands, dt: float
@@ -201,13 +257,61 @@ class Integrator(ABC):
         ``commands`` are as for :meth:`rollout_compiled`. Returns None if a motion fails.
         """
         try:
-            state, _ = self.start(scene, q0, v0)
+            state = self.begun(scene, q0, v0)
         except SingularMassMatrix:
             return None
-        parts = self.rollout_compiled(scene, state, commands, scene.silence, scene.no_drift, dt)
-        if any(part.failure is not None for part in parts):
-            return None
-        return np.array([part.q for part in parts]), np.array([part.v for part in parts])
+        nodes = new_nodes(len(q0), steps_of(commands), scene.robot.dof, scene.controls)
+        state.paths.roll(dt, commands, scene.silence, scene.no_drift, nodes)
+        return None if nodes.ended.any() else (nodes.q, nodes.v)
+
+    def kicked(
+        self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
+    ) -> Segment:
+        """One step of the only path under a drift (n,), with a noise impulse (n,) or its first part."""
+        kicks = None
+        if impulse is not None:
+            kicks = np.zeros((1, 1, 2, impulse.size))
+            kicks[0, 0, 0] = self.left * impulse
+        return self.rollout_compiled(scene, state, command, scene.silence, drift[None, None], dt, kicks)[0]
+
+    def _controls(
+        self, scene: Scene, row: Commands, decided: Floats, q: Floats, v: Floats, dt: float
+    ) -> tuple[Commands, Floats, Floats]:
+        """The steps of a decision (hold, m) at a state, and controls (hold, m) at begins and ends of steps."""
+        now, begins, ends = open_loop(decided)._replace(within=row.within), decided, decided
+        if len(row.stage_times):
+            mean, stages, nodes = lines(row, decided, self.stage_times)
+            now = open_loop(mean) if not stages.size else open_loop(mean)._replace(within=np.ascontiguousarray(stages))
+            begins, ends = nodes[:-1], nodes[1:]
+        if scene.inputs:
+            after = in_parts_of_steps(scene, decided[:1], q[None], v[None], dt * row.hold, row.hold)
+            now, begins, ends = prescribing(scene, now, after), *(with_ends(scene, u, after) for u in (begins, ends))
+        return now, begins, ends
+
+    def _step_in_python(
+        self, scene: Scene, state: Run, now: Commands, ends: tuple[Floats, Floats], drawn: Floats | None, dt: float
+    ) -> Segment:
+        """One step of one path with fields in Python, between controls ``ends`` (1, m), with increments ``drawn``."""
+        start, k = state.start[0], scene.processes
+        sloped = drawn is not None and drawn.size > k
+        around = ends if sloped or scene.noise.velocity_dependent else None
+
+        def noise() -> tuple[Floats | None, Floats]:
+            """The impulse of the increments at the state of the path, and the drift."""
+            q, _, v = self._state_of(state)
+            F, drift = diffusion_and_drift(scene, q, v, now.u[0], start, around)
+            if drawn is None:
+                return None, drift
+            impulse = F[:, :k] @ drawn[:k]
+            return impulse + F[:, k:] @ drawn[k:] if sloped else impulse, drift
+
+        impulse, drift = noise()
+        segment = self.kicked(scene, state, now, self.drift_share * drift, impulse, dt)
+        if impulse is not None and self.left < 1.0 and segment.failure is None:
+            impulse, _ = noise()
+            state.paths.kick((1.0 - self.left) * np.array([impulse]))
+            _, segment.p[-1:], segment.v[-1:], segment.energy[-1:] = state.paths.nodes()
+        return segment
 
     def quiet_ends(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
         """The ends of the steps at dw = 0, q and v (N, n), for integrators that apply noise after the step.
@@ -274,118 +378,6 @@ class Integrator(ABC):
         return FilterArrays(*arrays)
 
 
-@dataclass(frozen=True)
-class Run:
-    """State of a rollout in the core."""
-
-    paths: Any  # with their work arrays
-    start: Floats  # initial configurations (P, n) [rad or m]
-    driven: bool = False  # whether the scene has kinematic inputs
-
-
-class Compiled(Integrator):
-    """An integrator whose paths are in the core; ``reasons`` are the texts of their outcomes."""
-
-    reasons: ClassVar[Mapping[int, str]]
-
-    @abstractmethod
-    def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
-        """The state of a rollout of P paths at (q0, v0), each (P, n)."""
-
-    @abstractmethod
-    def state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
-        """The q, p and v (n,) of the only path."""
-
-    def kicked(
-        self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
-    ) -> Segment:
-        """One step of the only path under a drift (n,), with a noise impulse (n,) or its first part."""
-        kicks = None
-        if impulse is not None:
-            kicks = np.zeros((1, 1, 2, impulse.size))
-            kicks[0, 0, 0] = self.left * impulse
-        return self.rollout_compiled(scene, state, command, scene.silence, drift[None, None], dt, kicks)[0]
-
-    def rollout(self, scene: Scene, state: Run, commands: Commands, increments: Floats, dt: float) -> list[Segment]:
-        if scene.noise.diffusion is not None:
-            return super().rollout(scene, state, commands, increments, dt)
-        segments: list[Segment] = []
-        hold, before = commands.hold, commands.before
-        for j in range(steps_of(commands) // hold):
-            q, p, v = self.state_of(state)
-            decided = control_of(commands, j, np.concatenate([q, p if self.variational else v]), before)
-            row = rows(commands, j, j + 1, before)
-            now, begins, ends = self._controls(scene, row, np.tile(decided, (hold, 1)), q, v, dt)
-            for k in range(hold):
-                drawn = increments[0, j * hold + k] if len(increments) else None
-                around = begins[k : k + 1], ends[k : k + 1]
-                segments.append(self._step_in_python(scene, state, rows(now, k, k + 1), around, drawn, dt))
-                segments[-1].u[:] = decided
-                if segments[-1].failure is not None:
-                    return [join(segments)]
-            before = decided[None]
-        return [join(segments)]
-
-    def _controls(
-        self, scene: Scene, row: Commands, decided: Floats, q: Floats, v: Floats, dt: float
-    ) -> tuple[Commands, Floats, Floats]:
-        """The steps of a decision (hold, m) at a state, and controls (hold, m) at begins and ends of steps."""
-        now, begins, ends = open_loop(decided)._replace(within=row.within), decided, decided
-        if len(row.stage_times):
-            mean, stages, nodes = lines(row, decided, self.stage_times)
-            now = open_loop(mean) if not stages.size else open_loop(mean)._replace(within=np.ascontiguousarray(stages))
-            begins, ends = nodes[:-1], nodes[1:]
-        if scene.inputs:
-            after = in_parts_of_steps(scene, decided[:1], q[None], v[None], dt * row.hold, row.hold)
-            now, begins, ends = prescribing(scene, now, after), *(with_ends(scene, u, after) for u in (begins, ends))
-        return now, begins, ends
-
-    def _step_in_python(
-        self, scene: Scene, state: Run, now: Commands, ends: tuple[Floats, Floats], drawn: Floats | None, dt: float
-    ) -> Segment:
-        """One step of one path with fields in Python, between controls ``ends`` (1, m), with increments ``drawn``."""
-        q, _, v = self.state_of(state)
-        start = state.start[0]
-        F, drift = diffusion_and_drift(scene, q, v, now.u[0], start, ends)
-        impulse = None if drawn is None else noise_of_step(scene, F, q, v, ends, start, drawn)
-        segment = self.kicked(scene, state, now, self.drift_share * drift, impulse, dt)
-        if drawn is not None and self.left < 1.0 and segment.failure is None:
-            q, _, v = self.state_of(state)
-            F, _ = diffusion_and_drift(scene, q, v, now.u[0], start)
-            state.paths.kick((1.0 - self.left) * noise_of_step(scene, F, q, v, ends, start, drawn)[None])
-            _, segment.p[-1:], segment.v[-1:], segment.energy[-1:] = state.paths.nodes()
-        return segment
-
-    def rollout_compiled(
-        self,
-        scene: Scene,
-        state: Run,
-        commands: Commands,
-        increments: Floats,
-        drift: Floats,
-        dt: float,
-        impulses: Floats | None = None,
-    ) -> list[Segment]:
-        nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
-        state.paths.roll(dt, commands, increments, drift, nodes, impulses=impulses)
-        return self._segments(scene, state.paths, nodes)
-
-    def _segments(self, scene: Scene, paths: Any, nodes: RolloutArrays) -> list[Segment]:  # noqa: ARG002
-        """A segment for each of the core's paths, which have written ``nodes``."""
-        return segments_of(nodes, self.reasons, paths)
-
-    def motions(
-        self, scene: Scene, q0: Floats, v0: Floats, commands: Commands, dt: float
-    ) -> tuple[Floats, Floats] | None:
-        try:
-            state = self.begun(scene, q0, v0)
-        except SingularMassMatrix:
-            return None
-        nodes = new_nodes(len(q0), steps_of(commands), scene.robot.dof, scene.controls)
-        state.paths.roll(dt, commands, scene.silence, scene.no_drift, nodes)
-        return None if nodes.ended.any() else (nodes.q, nodes.v)
-
-
 def written(made: object, named: Sequence[str] = ()) -> str:
     """A dataclass as the text of its constructor call, with the options in ``named`` and those not at their default."""
     given: dict[str, Any] = {item.name: item.default for item in fields(made)} if is_dataclass(made) else {}
@@ -421,52 +413,32 @@ def join(segments: Sequence[Segment]) -> Segment:
 def diffusion_and_drift(
     scene: Scene, q: Floats, v: Floats, u: Floats, start: Floats, ends: tuple[Floats, Floats] | None = None
 ) -> tuple[Floats, Floats]:
-    """Diffusion fields F (n, k) at one state, and the Ito correction: the drift (n,) from Stratonovich to Ito.
+    """Diffusion fields F (n, K) at one state, and the Ito correction: the drift (n,) from Stratonovich to Ito.
 
-    The drift is (1/2) sum_i (dF_i/dv) M^-1 F_i [N m or N], equation (N1) and (1.3) of the paper; it is zero if no field
-    depends on the velocity. Of controls that are linear over a step between ``ends`` (1, m) it is the mean drift.
+    Of controls that are linear over a step between ``ends`` (1, m) the drift is the mean.
     """
-    diffusion = over_steps(
-        scene.noise, q[None], v[None], u[None], ends if scene.noise.velocity_dependent else None, start
-    )
-    F, k = diffusion.F[0], scene.processes
-    if diffusion.Fv is None:
-        return F[:, :k], np.zeros_like(q)
-    M = lagrangian_jet(scene, q, v).Lvv
-    return F[:, :k], 0.5 * np.einsum("ikj,jk->i", diffusion.Fv[0], np.linalg.solve(M, F))
+    found = over_steps(scene.noise, q[None], v[None], u[None], ends, start)
+    return found.F[0], _drift(scene, q[None], v[None], found)[0]
 
 
-def noise_of_step(
-    scene: Scene, F: Floats, q: Floats, v: Floats, ends: tuple[Floats, Floats], start: Floats, dw: Floats
-) -> Floats:
-    """The impulse (n,) of increments dw (K,) at a state, by fields in Python: F (n, k) of the mean.
+def _drift(scene: Scene, q: Floats, v: Floats, fields: Fields) -> Floats:
+    """The drift (N, n) from Stratonovich to Ito, (1/2) sum_i (dF_i/dv) M^-1 F_i [N m or N], at (q, v) (N, n).
 
-    ``ends`` (1, m) are the controls at both ends of the step, ``start`` (n,) is the first configuration of the motion.
+    Equation (N1), and (1.3) of the paper; it is zero if no field depends on the velocity.
     """
-    k = scene.processes
-    impulse: Floats = F @ dw[:k]
-    if dw.size > k:
-        impulse = impulse + over_steps(scene.noise, q[None], v[None], ends[0], ends, start).F[0, :, k:] @ dw[k:]
-    return impulse
+    if fields.Fv is None:
+        return np.zeros_like(q)
+    M, _ = scene.core.jets(np.ascontiguousarray(q), np.ascontiguousarray(v))
+    drift: Floats = 0.5 * np.einsum("Nikj,Njk->Ni", fields.Fv, np.linalg.solve(M, fields.F))
+    return drift
 
 
 def drifts(scene: Scene, trajectory: Trajectory) -> Floats | float:
     """The drift of :func:`diffusion_and_drift` at the start of every step (N, n), or 0 where none has any."""
     if not scene.noise.velocity_dependent:
         return 0.0
-    nodes = zip(trajectory.q[:-1], trajectory.v[:-1], trajectory.u, strict=True)
-    return np.array(
-        [
-            diffusion_and_drift(scene, q, v, u, trajectory.q[0], ends_at(trajectory, k))[1]
-            for k, (q, v, u) in enumerate(nodes)
-        ]
-    )
-
-
-def ends_at(trajectory: Trajectory, k: int) -> tuple[Floats, Floats] | None:
-    """The controls (1, m) at both ends of step k where they are linear between nodes; else None."""
-    nodes = trajectory.u_nodes
-    return (nodes[k : k + 1], nodes[k + 1 : k + 2]) if nodes.shape[1] else None
+    q, v = trajectory.q[:-1], trajectory.v[:-1]
+    return _drift(scene, q, v, noise_fields(scene, trajectory, q, v, trajectory.q[0]))
 
 
 def noise_fields(

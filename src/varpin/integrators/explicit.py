@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -12,16 +12,15 @@ import scipy
 from varpin import core
 from varpin.arrays import Floats
 from varpin.core import ExplicitMethod, Mechanism, Outcome
-from varpin.core.arrays import Commands, FilterArrays, FilterLog, new_nodes
-from varpin.errors import LinearizationError, SingularMassMatrix
+from varpin.core.arrays import Commands, FilterArrays, FilterLog
+from varpin.errors import LinearizationError
 from varpin.integrators.base import (
-    Compiled,
+    Integrator,
     Run,
     Segment,
     Varied,
     drifts,
     forces,
-    segments_of,
 )
 from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.trajectory import Trajectory
@@ -33,7 +32,7 @@ REASONS: dict[int, str] = {
 
 
 @dataclass(frozen=True)
-class _Explicit(Compiled):
+class _Explicit(Integrator):
     """The base class of explicit methods."""
 
     method: ClassVar[ExplicitMethod]
@@ -47,29 +46,13 @@ class _Explicit(Compiled):
     # In a motion no mass matrix but that of angles beyond rounding is singular.
     reasons = dict.fromkeys(REASONS, REASONS[Outcome.not_finite])
 
-    def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[Run, list[Segment]]:
-        refuse_constraints(scene, self)
-        if scene.custom is not None:
-            scene.custom.check(q0, v0)
-        run, nodes = self.begun(scene, q0, v0), new_nodes(len(q0), 1, scene.robot.dof, scene.controls)
-        if not run.paths.first_nodes(nodes):
-            raise SingularMassMatrix(scene.robot.joint_names, q0)
-        return run, segments_of(nodes, REASONS)
-
     def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
+        refuse_constraints(scene, self)
         return Run(core.ExplicitRollout.start(scene.core, self.method, q0, v0), q0.copy())
 
     def damped(self, z: Floats) -> tuple[Floats, Floats]:
-        """See :meth:`Integrator.damped`."""
         kept = np.polynomial.polynomial.polyval(-z, 1.0 / scipy.special.factorial(np.arange(self.order + 1)))
         return kept, kept
-
-    def fork(self, state: Run) -> Run:
-        return replace(state, paths=state.paths.copy())
-
-    def state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
-        """See :meth:`Compiled.state_of`; p is none of its own."""
-        return state.paths.q[0], state.paths.q[0, :0], state.paths.v[0]
 
     def linearize(
         self, scene: Scene, trajectory: Trajectory, *, ramps: bool = False

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import ClassVar
 
 import numpy as np
 import scipy
 
 from varpin.arrays import Floats
-from varpin.core import ExplicitMethod, ExplicitRollout, ForwardDynamics
-from varpin.core.arrays import Commands, RolloutArrays, new_nodes
-from varpin.errors import InputError, LinearizationError, SingularMassMatrix
-from varpin.integrators.base import Failure, Integrator, Segment, drifts, forces, segments_of
-from varpin.integrators.explicit import REASONS, accelerations
+from varpin.core import ExplicitMethod, ExplicitRollout, ForwardDynamics, Outcome
+from varpin.core.arrays import Commands, RolloutArrays
+from varpin.errors import InputError, LinearizationError
+from varpin.integrators.base import Integrator, Run, drifts, forces
+from varpin.integrators.explicit import accelerations
 from varpin.integrators.tableau import gauss_coefficients
 from varpin.mechanics.scene import Scene, refuse_constraints
-from varpin.signals.commands import control_of, interpolation, steps_of
+from varpin.signals.commands import control_of, interpolation
 from varpin.support.checks import positive
 from varpin.trajectory import Trajectory
 
@@ -30,15 +32,6 @@ _POINTS = 8
 # Lower bound of the speed in tolerances [rad/s or m/s], so that rounding in an equilibrium is not resolved.
 _SLOWEST = 1e-3
 TOO_STEEP = "the adaptive method cannot go on: the motion runs away, or its tolerance is beyond rounding"
-
-
-@dataclass
-class ReferenceRun:
-    """State of a rollout: (q, v) of each path (P, 2n), forward dynamics, and the last internal step [s], 0 for none."""
-
-    x: Floats
-    dynamics: ForwardDynamics
-    tried: float
 
 
 class _RunsAway(ArithmeticError):
@@ -66,6 +59,7 @@ class Reference(Integrator):
     variational = False
     named = ("rtol",)
     order = 8
+    reasons: ClassVar[Mapping[int, str]] = MappingProxyType({Outcome.not_finite: TOO_STEEP})
 
     def __post_init__(self) -> None:
         if not TIGHTEST <= positive("rtol", self.rtol, "1") <= 1e-2:
@@ -77,98 +71,20 @@ class Reference(Integrator):
     def stage_times(self) -> tuple[float, ...]:
         return tuple(gauss_coefficients(_POINTS)[2].tolist())
 
-    def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[ReferenceRun, list[Segment]]:
-        """See :meth:`Integrator.start`."""
+    def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
         refuse_constraints(scene, self)
         if scene.processes:
             raise InputError(f"{self} integrates no noise: leave it out of the scene")
-        if scene.custom is not None:
-            scene.custom.check(q0, v0)
-        run = ReferenceRun(x=np.hstack([q0, v0]), dynamics=ForwardDynamics(scene.core), tried=0.0)
-        nodes = new_nodes(len(q0), 1, scene.robot.dof, scene.controls)
-        if not ExplicitRollout.start(scene.core, ExplicitMethod.runge_kutta, q0, v0).first_nodes(nodes):
-            raise SingularMassMatrix(scene.robot.joint_names, q0)
-        return run, segments_of(nodes, REASONS)
+        return Run(_Paths(self, scene, np.hstack([q0, v0]), ForwardDynamics(scene.core)), q0.copy())
 
-    def fork(self, state: ReferenceRun) -> ReferenceRun:
-        return replace(state, x=state.x.copy())
-
-    def rollout_compiled(
-        self,
-        scene: Scene,
-        state: ReferenceRun,
-        commands: Commands,
-        increments: Floats,
-        drift: Floats,
-        dt: float,
-        impulses: Floats | None = None,
-    ) -> list[Segment]:
-        """See :meth:`Integrator.rollout_compiled`; the rate of change is compiled, the steps are those of SciPy."""
-        if increments.size or impulses is not None:
-            raise InputError(f"{self} integrates no noise: leave it out of the scene")
-        nodes = new_nodes(len(state.x), steps_of(commands), scene.robot.dof, scene.controls)
-        failures = [self._path(scene, state, commands, drift, dt, nodes, i) for i in range(len(state.x))]
-        segments = segments_of(nodes, REASONS)
-        return [
-            segment if failure is None else replace(segment, failure=failure)
-            for segment, failure in zip(segments, failures, strict=True)
-        ]
-
-    def _path(
-        self,
-        scene: Scene,
-        state: ReferenceRun,
-        commands: Commands,
-        drift: Floats,
-        dt: float,
-        nodes: RolloutArrays,
-        i: int,
-    ) -> Failure | None:
-        """Write the steps of path ``i`` to ``nodes``; return the failure, if any."""
-        u = nodes.u[i]
-        for s in range(len(u)):
-            decision, held = divmod(s, commands.hold)
-            before = u[s - 1 : s] if s else commands.before[i : i + 1]
-            u[s] = before[0] if held else control_of(commands, decision, state.x[i], before)
-            values = commands.within[s] if len(commands.within) else u[s : s + 1]
-            if len(commands.stage_times):
-                first = u[s - held - 1] if s > held else commands.before[i]
-                share = (held + commands.stage_times[:, None]) / commands.hold
-                values = (1.0 - share) * first + share * u[s]
-            force = self._force(values @ scene.actuation.T + (drift[i, s] if len(drift) else 0.0), dt)
-            try:
-                x, nodes.tally[i, s, 2] = self._step(state, i, force, dt)
-            except _RunsAway:
-                return Failure(TOO_STEEP, 0.0)
-            state.x[i] = x
-            nodes.p[i, s], nodes.energy[i, s], regular = state.dynamics.node(x)
-            nodes.q[i, s], nodes.v[i, s] = np.split(x, 2)
-            if not (regular and np.isfinite(nodes.energy[i, s])):
-                return Failure(TOO_STEEP, 0.0)
-            nodes.done[i] = s + 1
-        return None
-
-    def _force(self, values: Floats, dt: float) -> Force:
+    def force_of(self, values: Floats, dt: float) -> Force:
         """The force (n,) as a function of time [s] in a step, from values at its stages (s, n) or a constant (1, n)."""
         if len(values) == 1:
             return lambda _: values[0]
         times = np.array(self.stage_times)
         return lambda t: interpolation(times, np.array([t / dt]))[0] @ values
 
-    def _step(self, state: ReferenceRun, i: int, force: Force, dt: float) -> tuple[Floats, int]:
-        """(q, v) of path ``i`` after one step, and the number of evaluations of forward dynamics."""
-
-        def rate(t: float, x: Floats) -> Floats:
-            slope, regular = state.dynamics.rate(x, force(t))
-            if not (regular and np.isfinite(slope).all()):
-                raise _RunsAway
-            return slope
-
-        atol = self._atol(state.x[i], rate(0.0, state.x[i]), dt)
-        x, evaluations, state.tried = _integrate(rate, state.x[i], dt, self.rtol, atol, state.tried)
-        return x, evaluations + 1
-
-    def _atol(self, x: Floats, slope: Floats, dt: float) -> Floats:
+    def atol_at(self, x: Floats, slope: Floats, dt: float) -> Floats:
         """Absolute tolerances on (q, v) (2n,) around a state."""
         n = len(x) // 2
         speed = max(np.abs(x[n:]).max() + dt * np.abs(slope[n:]).max(), _SLOWEST)
@@ -197,7 +113,7 @@ class Reference(Integrator):
         for k in range(trajectory.steps):
             x = np.append(trajectory.q[k], trajectory.v[k])
             try:
-                J[k] = self._derivatives(scene, x, self._force(force[k], dt), dt, ramp=ramp)
+                J[k] = self._derivatives(scene, x, self.force_of(force[k], dt), dt, ramp=ramp)
             except (_RunsAway, LinearizationError):
                 raise LinearizationError(k, k * dt, TOO_STEEP) from None
         return J
@@ -218,7 +134,7 @@ class Reference(Integrator):
 
         y = np.concatenate([x, np.eye(2 * n, 3 * n).ravel()])
         slope = rate(dt if ramp else 0.0, y)
-        atol = self._atol(x, slope[: 2 * n], dt)
+        atol = self.atol_at(x, slope[: 2 * n], dt)
         # Scales by units: dv/dq is a rate, dq/dv a time, derivatives in the force are inverse inertias.
         blocks = np.empty((2 * n, 3 * n))
         unit = atol[0]
@@ -228,6 +144,79 @@ class Reference(Integrator):
         blocks[n:, :n], blocks[n:, n : 2 * n], blocks[n:, 2 * n :] = unit * fast, unit, unit * light
         end, _, _ = _integrate(rate, y, dt, self.rtol, np.append(atol, blocks.ravel()), 0.0)
         return end[2 * n :].reshape(2 * n, 3 * n)
+
+
+@dataclass
+class _Paths:
+    """P paths of a rollout."""
+
+    method: Reference
+    scene: Scene
+    x: Floats  # (q, v) of each path (P, 2n)
+    dynamics: ForwardDynamics
+    tried: float = 0.0  # last internal step [s], 0 for none
+
+    def copy(self) -> _Paths:
+        return replace(self, x=self.x.copy())
+
+    def first_nodes(self, nodes: RolloutArrays) -> bool:
+        """See :class:`varpin.core.ExplicitRollout`."""
+        q, v = (np.ascontiguousarray(part) for part in np.hsplit(self.x, 2))
+        return ExplicitRollout.start(self.scene.core, ExplicitMethod.runge_kutta, q, v).first_nodes(nodes)
+
+    def roll(
+        self,
+        dt: float,
+        commands: Commands,
+        increments: Floats,
+        drift: Floats,
+        nodes: RolloutArrays,
+        impulses: Floats | None = None,
+    ) -> None:
+        """See :class:`varpin.core.ExplicitRollout`; the rate of change is compiled, the steps are those of SciPy."""
+        if increments.size or impulses is not None:
+            raise InputError(f"{self.method} integrates no noise: leave it out of the scene")
+        for i in range(len(self.x)):
+            if not self._path(i, dt, commands, drift, nodes):
+                nodes.ended[i] = Outcome.not_finite
+
+    def _path(self, i: int, dt: float, commands: Commands, drift: Floats, nodes: RolloutArrays) -> bool:
+        """Write the steps of path ``i``; False where it cannot go on."""
+        u = nodes.u[i]
+        for s in range(len(u)):
+            decision, held = divmod(s, commands.hold)
+            before = u[s - 1 : s] if s else commands.before[i : i + 1]
+            u[s] = before[0] if held else control_of(commands, decision, self.x[i], before)
+            values = commands.within[s] if len(commands.within) else u[s : s + 1]
+            if len(commands.stage_times):
+                first = u[s - held - 1] if s > held else commands.before[i]
+                share = (held + commands.stage_times[:, None]) / commands.hold
+                values = (1.0 - share) * first + share * u[s]
+            force = self.method.force_of(values @ self.scene.actuation.T + (drift[i, s] if len(drift) else 0.0), dt)
+            try:
+                x, nodes.tally[i, s, 2] = self._step(i, force, dt)
+            except _RunsAway:
+                return False
+            self.x[i] = x
+            nodes.p[i, s], nodes.energy[i, s], regular = self.dynamics.node(x)
+            nodes.q[i, s], nodes.v[i, s] = np.split(x, 2)
+            if not (regular and np.isfinite(nodes.energy[i, s])):
+                return False
+            nodes.done[i] = s + 1
+        return True
+
+    def _step(self, i: int, force: Force, dt: float) -> tuple[Floats, int]:
+        """(q, v) of path ``i`` after one step, and the number of evaluations of forward dynamics."""
+
+        def rate(t: float, x: Floats) -> Floats:
+            slope, regular = self.dynamics.rate(x, force(t))
+            if not (regular and np.isfinite(slope).all()):
+                raise _RunsAway
+            return slope
+
+        atol = self.method.atol_at(self.x[i], rate(0.0, self.x[i]), dt)
+        x, evaluations, self.tried = _integrate(rate, self.x[i], dt, self.method.rtol, atol, self.tried)
+        return x, evaluations + 1
 
 
 def _integrate(rate: Rate, x: Floats, dt: float, rtol: float, atol: Floats, tried: float) -> tuple[Floats, int, float]:

@@ -10,12 +10,12 @@ from typing import Any
 
 from varpin.errors import InputError
 from varpin.integrators.base import Integrator
-from varpin.integrators.collocation import Gauss, Radau
+from varpin.integrators.collocation import Gauss, Midpoint, Radau
 from varpin.integrators.explicit import ExplicitEuler, RungeKutta4, SemiImplicitEuler
-from varpin.integrators.midpoint import Midpoint
 from varpin.integrators.reference import Reference
 from varpin.integrators.variational import Guard
-from varpin.mechanics.scene import Scene, differences, same
+from varpin.mechanics.scene import Scene
+from varpin.mechanics.values import differences, same
 from varpin.trajectory import Trajectory, require_trajectory
 
 _OWN: tuple[type[Integrator], ...] = (Midpoint, Gauss, Radau, ExplicitEuler, SemiImplicitEuler, RungeKutta4, Reference)

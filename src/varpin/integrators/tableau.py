@@ -1,6 +1,7 @@
 """Coefficients of collocation: Gauss-Legendre and Radau points, and the generalized midpoint rule."""
 
 import functools
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -43,39 +44,52 @@ def _read_only(a: Floats, b: Floats, c: Floats) -> tuple[Floats, Floats, Floats]
     return a, b, c
 
 
-def _reach(a: Floats, b: Floats) -> float:
+class Scheme(NamedTuple):
+    """A method of collocation on a unit step."""
+
+    tableau: Tableau  # for the core
+    # How forces act: A (s, s), b (s,) and c (s,).
+    a: Floats
+    b: Floats
+    c: Floats
+    times: Floats  # of the stages (s,)
+    places: Floats | None = None  # :func:`lobatto_places` where constraints hold; None if they do not
+
+
+def _scheme(points: tuple[Floats, Floats, Floats], ahead: Floats, places: Floats | None, *, stiff: bool) -> Scheme:
+    a, b, c = points
     root = np.sqrt(b)
     square = (root[:, None] * (a @ a)) / root[None, :]
-    return float(np.linalg.eigvalsh(0.5 * (square + square.T))[-1])
-
-
-@functools.cache
-def gauss(stages: int) -> Tableau:
-    """The Gauss-Legendre tableau of ``stages`` stages, of order 2 ``stages``."""
-    a, b, c = gauss_coefficients(stages)
-    ahead = interpolation(np.append(c, 1.0), 1.0 + c)
-    return Tableau.make(
-        a=a, gradient=a, force=a, b=b, c=c, ahead=ahead, reach=_reach(a, b), skew=0.0, stiffly_accurate=False
+    reach = float(np.linalg.eigvalsh(0.5 * (square + square.T))[-1])
+    tableau = Tableau.make(
+        a=a, gradient=a, force=a, b=b, c=c, ahead=ahead, reach=reach, skew=0.0, stiffly_accurate=stiff
     )
+    return Scheme(tableau, *points, c, places)
 
 
 @functools.cache
-def radau(stages: int) -> Tableau:
-    """The Radau IIA tableau of ``stages`` stages, of order 2 ``stages`` - 1. Its last stage is the end of the step."""
-    a, b, c = radau_coefficients(stages)
-    ahead = np.column_stack([interpolation(c, 1.0 + c), np.zeros(stages)])
-    return Tableau.make(
-        a=a, gradient=a, force=a, b=b, c=c, ahead=ahead, reach=_reach(a, b), skew=0.0, stiffly_accurate=True
-    )
+def gauss(stages: int) -> Scheme:
+    """The Gauss-Legendre method of ``stages`` stages, of order 2 ``stages``."""
+    points = gauss_coefficients(stages)
+    ahead = interpolation(np.append(points[2], 1.0), 1.0 + points[2])
+    return _scheme(points, ahead, lobatto_places(stages), stiff=False)
 
 
 @functools.cache
-def midpoint(alpha: float) -> Tableau:
+def radau(stages: int) -> Scheme:
+    """The Radau IIA method of ``stages`` stages, of order 2 ``stages`` - 1. Its last stage is the end of the step."""
+    points = radau_coefficients(stages)
+    ahead = np.column_stack([interpolation(points[2], 1.0 + points[2]), np.zeros(stages)])
+    return _scheme(points, ahead, None, stiff=True)
+
+
+@functools.cache
+def midpoint(alpha: float) -> Scheme:
     """The generalized midpoint rule: the Lagrangian at ``alpha``, each half-step with half of the forces' impulse."""
     one = np.ones(1)
     # The prediction interpolates between c = 1/2, for every alpha, and 1: the two points must differ.
     ahead = interpolation(np.array([0.5, 1.0]), np.array([1.5]))
-    return Tableau.make(
+    tableau = Tableau.make(
         a=np.full((1, 1), alpha),
         gradient=np.full((1, 1), 1.0 - alpha),
         force=np.full((1, 1), 0.5),
@@ -86,6 +100,7 @@ def midpoint(alpha: float) -> Tableau:
         skew=alpha - 0.5,
         stiffly_accurate=False,
     )
+    return Scheme(tableau, *gauss_coefficients(1), alpha * one, lobatto_places(1) if alpha == 0.5 else None)
 
 
 @functools.cache

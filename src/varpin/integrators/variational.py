@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -16,13 +16,11 @@ from varpin.core import (
     Parameters,
     Rollout,
     Steps,
-    Tableau,
     filter_variational,
 )
-from varpin.core.arrays import Commands, FilterArrays, FilterLog, RolloutArrays, new_nodes
+from varpin.core.arrays import Commands, FilterArrays, FilterLog, RolloutArrays
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
-    Compiled,
     Integrator,
     Run,
     Segment,
@@ -30,10 +28,10 @@ from varpin.integrators.base import (
     drifts,
     forces,
     gear,
-    segments_of,
     without_inputs,
     written,
 )
+from varpin.integrators.tableau import Scheme
 from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.signals.commands import cubics
@@ -98,7 +96,7 @@ class Guard:
         return text if text.endswith(")") else f"{text}()"
 
 
-class Variational(Compiled):
+class Variational(Integrator):
     """A variational integrator on (q, p) with guarded steps and noise impulses."""
 
     guard: Guard | None
@@ -106,11 +104,13 @@ class Variational(Compiled):
 
     variational = True
     reasons = REASONS
+    # Factors of the guard's energy balance and energy budget, of methods with more than one stage.
+    shares: ClassVar[tuple[float, float]] = (1.0, 1.0)
 
-    def same_map(self, other: Integrator) -> bool:
-        """See :meth:`Integrator.same_map`; guards and tolerances do not change the map of an undivided step."""
-        mine, others = ({k: v for k, v in vars(x).items() if k not in ("guard", "tolerance")} for x in (self, other))
-        return type(self) is type(other) and mine == others
+    @property
+    @abstractmethod
+    def scheme(self) -> Scheme:
+        """The points and coefficients of the method."""
 
     def __post_init__(self) -> None:
         if not (self.guard is None or isinstance(self.guard, Guard)):
@@ -119,35 +119,27 @@ class Variational(Compiled):
         word("kick", self.kick, ("left", "split", "held"))
 
     def damped(self, z: Floats) -> tuple[Floats, Floats]:
-        """See :meth:`Integrator.damped`."""
-        a, b, c = self._coefficients()
+        _, a, b, c, *_ = self.scheme
         stages = np.linalg.solve(np.eye(len(c)) + z[:, None, None] * a, np.stack([np.ones_like(c), c], axis=1))
         kept, held = (1.0 - z[:, None] * (b @ stages)).T
         return kept, held if self.holds_noise else self.left * kept + (1.0 - self.left)
 
     @property
     def keeps_constraints(self) -> bool:
-        return self._constraint_places() is not None
+        return self.scheme.places is not None
 
-    @abstractmethod
-    def _coefficients(self) -> tuple[Floats, Floats, Floats]:
-        """A (s, s), b (s,) and c (s,) over a unit step, by which forces act."""
-
-    @abstractmethod
-    def _tableau(self) -> Tableau:
-        """The coefficients of the method."""
-
-    def _constraint_places(self) -> Floats | None:
-        """:func:`lobatto_places` of the points where constraints hold; None for methods without constraints."""
-        return None
+    @property
+    def stage_times(self) -> tuple[float, ...]:
+        times: list[float] = self.scheme.times.tolist()
+        return tuple(times) if len(times) > 1 else ()
 
     def _places(self, scene: Scene) -> Floats:
-        """:meth:`_constraint_places`, checked for a scene with constraints.
+        """The points where constraints hold, checked for a scene with constraints.
 
         Raises:
             InputError: The method takes no constraints, or the scene has noise that does not go with them.
         """
-        places = self._constraint_places()
+        places = self.scheme.places
         if places is None:
             refuse_constraints(scene, self)
             raise InputError(f"{self} keeps no constraints")
@@ -163,45 +155,37 @@ class Variational(Compiled):
             raise InputError("noise whose fields depend on the velocity does not go with constraints")
         return places
 
-    def _shares(self) -> tuple[float, float]:
-        """Factors of the guard's energy balance and energy budget."""
-        return 1.0, 1.0
+    def guards(self, guard: Guard | None, *, energy: bool = True) -> Guards:
+        """A guard for the core; None accepts every root.
 
-    def _guards(self, *, energy: bool = True) -> Guards:
-        """Guards of the core. Without ``energy`` the balance is not checked: kinematic inputs exchange energy."""
-        if self.guard is None or energy:
-            return _core_guards(self.guard, *self._shares())
-        return _core_guards(replace(self.guard, energy_balance=_UNCHECKED, energy_budget=_UNCHECKED))
-
-    def _guards_again(self, trajectory: Trajectory) -> Guards:
-        """Guards for repeating the steps of a trajectory at dw = 0.
-
-        Without noise the steps are the same, and there is nothing to check. Otherwise the steps differ by the noise
-        impulses, and their roots must lie on the branch that is connected to dt -> 0.
+        Without ``energy`` the balance is not checked: kinematic inputs exchange energy.
         """
-        return self._guards(energy=False) if trajectory.noisy else _core_guards(None)
-
-    def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[Run, list[Segment]]:
-        """See :meth:`Integrator.start`; p0 = M(q0) v0."""
-        if scene.custom is not None:
-            scene.custom.check(q0, v0)
-        run = self.begun(scene, q0, v0)
-        nodes = new_nodes(len(q0), 1, scene.robot.dof, scene.controls)
-        nodes.q[:, 0], nodes.p[:, 0], nodes.v[:, 0], nodes.energy[:, 0] = run.paths.nodes()
-        nodes.done[:] = 1
-        return run, segments_of(nodes, REASONS)
+        given = guard or Guard(max_halvings=0)
+        balance, budget = self.shares if len(self.scheme.times) > 1 else (1.0, 1.0)
+        return Guards.make(
+            active=guard is not None,
+            branch_margin=float(given.branch_margin),
+            energy_balance=balance * float(given.energy_balance) if energy else _UNCHECKED,
+            energy_budget=budget * float(given.energy_budget) if energy else _UNCHECKED,
+            most_halvings=int(given.max_halvings),
+        )
 
     def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
-        """See :meth:`Compiled.begun`."""
-        guards, places = self._guards(energy=not scene.inputs), self._places(scene) if scene.constraints else None
-        method = scene.core, self._tableau(), float(self.tolerance), guards, self.left
+        guards = self.guards(self.guard, energy=not scene.inputs)
+        places = self._places(scene) if scene.constraints else None
+        method = scene.core, self.scheme.tableau, float(self.tolerance), guards, self.left
         rollout = Rollout(*method, len(q0), self.holds_noise, places)
         if not rollout.begin(q0, v0):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
         return Run(rollout, q0.copy(), bool(scene.inputs))
 
+    def _first(self, run: Run, nodes: RolloutArrays) -> bool:
+        nodes.q[:, 0], nodes.p[:, 0], nodes.v[:, 0], nodes.energy[:, 0] = run.paths.nodes()
+        nodes.done[:] = 1
+        return True
+
     def fork(self, state: Run) -> Run:
-        return replace(state, paths=state.paths.fork(self._guards(energy=not state.driven)))
+        return replace(state, paths=state.paths.fork(self.guards(self.guard, energy=not state.driven)))
 
     def _segments(self, scene: Scene, paths: Any, nodes: RolloutArrays) -> list[Segment]:
         found = super()._segments(scene, paths, nodes)
@@ -209,7 +193,7 @@ class Variational(Compiled):
             return found
         return [_constrained(scene, paths, i, segment) for i, segment in enumerate(found)]
 
-    def state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
+    def _state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
         q, p, v, _ = state.paths.nodes()
         return q[0], p[0], v[0]
 
@@ -233,7 +217,6 @@ class Variational(Compiled):
         return Jx, Jf, self._kicks(scene, trajectory, Jx, Jf), Jr if ramp else 0.5 * Jf
 
     def in_parameters(self, scene: Scene, trajectory: Trajectory, varied: Sequence[Varied]) -> Floats:
-        """See :meth:`Integrator.in_parameters`."""
         pairs = [(each.above.core, each.below.core) for each in varied]
         gears = np.array([[gear(scene, each.above), gear(scene, each.below)] for each in varied])
         distance = np.array([each.distance for each in varied])
@@ -330,8 +313,8 @@ class Variational(Compiled):
 
     def filtered(self, scene: Scene, log: FilterLog) -> FilterArrays:
         """See :meth:`Integrator.filtered`; the state is (q, p)."""
-        guards = _core_guards(replace(self.guard or Guard(), energy_balance=_UNCHECKED, energy_budget=_UNCHECKED))
-        found = filter_variational(scene.core, self._tableau(), float(self.tolerance), guards, log)
+        guards = self.guards(self.guard or Guard(), energy=False)
+        found = filter_variational(scene.core, self.scheme.tableau, float(self.tolerance), guards, log)
         return self._reached(found, log, REASONS)
 
     def _steps(self, scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
@@ -349,16 +332,18 @@ class Variational(Compiled):
         }
         return {
             "mechanism": scene.core,
-            "tableau": self._tableau(),
+            "tableau": self.scheme.tableau,
             "tolerance": float(self.tolerance),
-            "guards": self._guards_again(trajectory),
+            # Without noise the steps are the same, and there is nothing to check. Otherwise they differ by the noise
+            # impulses, and their roots must lie on the branch that is connected to dt -> 0.
+            "guards": self.guards(self.guard if trajectory.noisy else None, energy=False),
             "dt": float(trajectory.dt),
             **{name: np.ascontiguousarray(array) for name, array in arrays.items()},
         }
 
     def _guess(self, trajectory: Trajectory) -> Floats:
         """Stage velocities (N, s, n) at dw = 0 from the cubic through both nodes; with noise, those at the starts."""
-        v, moved, times = trajectory.v, np.diff(trajectory.q, axis=0), self._times()
+        v, moved, times = trajectory.v, np.diff(trajectory.q, axis=0), self.scheme.times
         if trajectory.noisy:
             return np.repeat(v[:-1, None], len(times), axis=1)
         if len(times) == 1:
@@ -366,10 +351,6 @@ class Variational(Compiled):
         along = cubics(times, trajectory.dt)[:, 5:]
         guess: Floats = np.einsum("se,kne->ksn", along, np.stack([v[:-1], moved, v[1:]], axis=2))
         return guess
-
-    @abstractmethod
-    def _times(self) -> Floats:
-        """Times of the stages in a unit step (s,)."""
 
 
 def _constrained(scene: Scene, paths: Rollout, i: int, segment: Segment) -> Segment:
@@ -398,17 +379,6 @@ def _along(scene: Scene, q: Floats) -> Floats:
         0, 2, 1
     )
     return found
-
-
-def _core_guards(given: Guard | None, balance: float = 1.0, budget: float = 1.0) -> Guards:
-    guard = given or Guard(max_halvings=0)
-    return Guards.make(
-        active=given is not None,
-        branch_margin=float(guard.branch_margin),
-        energy_balance=balance * float(guard.energy_balance),
-        energy_budget=budget * float(guard.energy_budget),
-        most_halvings=int(guard.max_halvings),
-    )
 
 
 def _require_solved(trajectory: Trajectory, outcome: int, done: int) -> None:

@@ -76,6 +76,8 @@ class Kind(NamedTuple):
 # Armature is an element of a scene, and part of the tree in the core.
 ELEMENTS = {"Armature": Kind(1, False, False)} | {name: Kind(*facts) for name, facts in element_kinds().items()}
 COUPLINGS = {name: Kind(*facts) for name, facts in coupling_kinds().items()}
+# Kinds of elements whose sums by joint are attributes of a scene.
+SUMMED = ("Armature", "JointDamper", "JointSpring")
 
 
 def bound_force(force: Force, robot: Robot) -> tuple[Element | Coupling, ...]:
@@ -467,30 +469,19 @@ def limited_servos(elements: Iterable[Element]) -> tuple[Element, ...]:
     return tuple(servo for servo in of_kind(elements, "PositionServo") if np.isfinite(servo.values[2]))
 
 
-def drive_force(servo: Element, q: Floats, v: Floats, force: Floats) -> Floats:
-    """The force of a servo on its joint (K,) [N m or N], S of :class:`PositionServo`.
-
-    Args:
-        servo: A ``PositionServo``.
-        q: The joint's positions (K,) [rad or m].
-        v: Its velocities (K,) [rad/s or m/s].
-        force: Stiffness times command (K,) [N m or N].
-    """
-    stiffness, damping, effort = servo.values
-    wanted = force - stiffness * q - damping * v
-    if not np.isfinite(effort):
-        return wanted
-    over = np.clip(np.abs(wanted) / effort - 0.9, 0.0, 0.2)
-    bent: Floats = np.sign(wanted) * effort * (np.minimum(np.abs(wanted) / effort, 0.9) + over - 2.5 * over**2)
-    return bent
-
-
 def drive_forces(elements: Iterable[Element], q: Floats, v: Floats, force: Floats) -> Floats:
-    """``force`` (K, n) [N m or N] with the columns of servos replaced by :func:`drive_force` at q and v (K, n)."""
+    """``force`` (K, n) [N m or N] with S of :class:`PositionServo` in the columns of servos, at q and v (K, n).
+
+    Those of ``force`` are stiffness times command.
+    """
     driven = force.copy()
     for servo in of_kind(elements, "PositionServo"):
-        c = servo.coordinate
-        driven[:, c] = drive_force(servo, q[:, c], v[:, c], force[:, c])
+        c, (stiffness, damping, effort) = servo.coordinate, servo.values
+        wanted = force[:, c] - stiffness * q[:, c] - damping * v[:, c]
+        if np.isfinite(effort):
+            over = np.clip(np.abs(wanted) / effort - 0.9, 0.0, 0.2)
+            wanted = np.sign(wanted) * effort * (np.minimum(np.abs(wanted) / effort, 0.9) + over - 2.5 * over**2)
+        driven[:, c] = wanted
     return driven
 
 

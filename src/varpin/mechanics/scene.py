@@ -5,13 +5,10 @@ Equation (1.1) of the paper.
 
 from __future__ import annotations
 
-import logging
 import weakref
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import count
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -19,53 +16,35 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats, Integers
 from varpin.core import Mechanism
-from varpin.core.arrays import Coupling, Diffusion, Element, Tied
+from varpin.core.arrays import Coupling, Diffusion, Element
 from varpin.errors import InputError
 from varpin.finding import Told
-from varpin.mechanics.constraints import (
-    Bound,
-    Constraint,
-    CustomConstraint,
-    KinematicInput,
-    bound_constraint,
-    joined,
-)
-from varpin.mechanics.custom import CustomForce, CustomForces
-from varpin.mechanics.description import description_constraints
+from varpin.mechanics.arguments import acting_forces, driven, given_constraints, gravity_of, is_input
+from varpin.mechanics.constraints import Bound, Constraint, CustomConstraint, bound_constraint, joined
+from varpin.mechanics.custom import CustomForces
 from varpin.mechanics.forces import (
-    ELEMENTS,
     CoulombFriction,
     Force,
     JointDamper,
     JointSpring,
     JointStop,
-    bound_force,
     dissipates,
     keeps_energy,
     of_kind,
-    refuse_where,
 )
 from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, bind, models_of
+from varpin.mechanics.values import values_of
 from varpin.model import Robot, require_robot
 from varpin.model.tree import block_ends, mechanism, path_coordinates
-from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array, tuple_of
+from varpin.support.checks import JointValues, joint_array
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
 
 if TYPE_CHECKING:
     from varpin.mechanics.reduction import Required
 
-logger = logging.getLogger(__name__)
-
-# Kinds of elements that are among the values as sums by joint.
-_SUMMED = ("Armature", "JointDamper", "JointSpring")
-# Arrays of the robot's tree and sums by joint among the values.
-_OF_TREE = ("center", "inertia", "rotation", "translation", "ratio", "offset")
-_OF_JOINTS = ("damping", "stiffness", "rest", "armature")
 # Largest constraint residual of a given configuration, and of a start that is projected without request [m or rad].
 _OFF, CORRECTED = 1e-6, 0.02
-# Gravity that no planet has, such as 9810 [m/s^2].
-_HEAVY = 100.0
 # Rank tolerance of the constraint Jacobian, relative to its largest singular value.
 _RANK = 1e-9
 # Forces that act only if the scene has them, by their names in a report.
@@ -163,15 +142,13 @@ class Scene(Frozen):
             UnknownFrame: A force or constraint names a frame that the robot does not have.
         """
         require_robot(robot)
-        values: dict[str, Any] = {"robot": robot, "gravity": _gravity(gravity, robot)}
-        values |= _forces(robot, forces, damping, friction, stiffness, rest)
+        values: dict[str, Any] = {"robot": robot, "gravity": gravity_of(gravity, robot)}
+        values |= acting_forces(robot, forces, damping, friction, stiffness, rest)
         values["constraints"] = given_constraints(robot, constraints)
         bound, order = joined([bound_constraint(constraint, robot) for constraint in values["constraints"]])
-        inputs = [tie.follower for tie in filter(_is_input, bound.rows.ties)]
-        servos = of_kind(values["elements"], "PositionServo")
-        driven = _driven(robot, _actuation(robot, actuation), servos, inputs)
-        values["actuation"], bound = _with_rates(driven, bound)
+        values["actuation"], bound = driven(robot, actuation, values["elements"], bound)
         models = models_of(noise)
+        servos = of_kind(values["elements"], "PositionServo")
         if servos and any(isinstance(model, ControlNoise) for model in models):
             raise InputError(
                 "ControlNoise is proportional to forces, but the control of joint "
@@ -179,7 +156,7 @@ class Scene(Frozen):
             )
         # Kinematic inputs absorb all forces on their joints.
         forced = values["actuation"].copy()
-        forced[inputs] = 0.0
+        forced[[tie.follower for tie in bound.rows.ties if is_input(tie)]] = 0.0
         values["noise"] = bind(models, forced, robot.joint_names)
         values |= {"bound_constraints": bound, "constraint_order": order, "announced": set()}
         for name, value in values.items():
@@ -364,12 +341,12 @@ class Scene(Frozen):
     def inputs(self) -> Mapping[int, int]:
         """The core's row of each :class:`KinematicInput`, mapped to the coordinate of its joint."""
         rows = self.bound_constraints.rows
-        return {len(rows.products) + k: tie.follower for k, tie in enumerate(rows.ties) if _is_input(tie)}
+        return {len(rows.products) + k: tie.follower for k, tie in enumerate(rows.ties) if is_input(tie)}
 
     @cached_property
     def rates(self) -> tuple[int, ...]:
         """For each of :attr:`inputs`, the control with its velocity at the end of a step; -1 for a linear input."""
-        return tuple(tie.rate for tie in self.bound_constraints.rows.ties if _is_input(tie))
+        return tuple(tie.rate for tie in self.bound_constraints.rows.ties if is_input(tie))
 
     @cached_property
     def prescribed(self) -> Integers:
@@ -511,27 +488,7 @@ class Scene(Frozen):
         The noise is stored as intensities (n, k); its factors of the controls are reduced to their norm. A
         :class:`varpin.CustomNoise` is not stored.
         """
-        values = {name: getattr(self, name) for name in ("gravity", *_OF_JOINTS, "actuation")}
-        values |= {name: getattr(self.robot.tree, name) for name in _OF_TREE}
-        rows: list[tuple[str, Sequence[float]]] = [
-            (each.kind, (each.coordinate, *each.values)) for each in self.elements if each.kind not in _SUMMED
-        ]
-        rows += [(each.kind, (each.a, each.b, *each.values)) for each in self.couplings]
-        # Functions are stored as their number only.
-        rows += [("functions", [len(self.custom.parts)])] if self.custom is not None else []
-        constraints = self.bound_constraints.rows
-        for product in constraints.products:
-            ends = (*constraints.vectors[product.x], *constraints.vectors[product.y])
-            places = [number for end in ends for number in (end.body, float(end.direction), *end.place)]
-            rows.append(("constraints.between", [product.factor, product.constant, *places]))
-        rows += [("constraints.ties", (t.follower, t.leader, t.rate, *t.coefficients)) for t in constraints.ties]
-        rows += [("constraints.custom", [own.rows]) for own in constraints.customs]
-        values |= {kind: np.zeros((0, 0)) for kind in ELEMENTS if kind not in _SUMMED} | _tables(rows)
-        if self.noise.diffusion is not None:
-            fields = self.noise.diffusion
-            values |= {"noise.constant": fields.constant, "noise.control": np.linalg.norm(fields.control, axis=2)}
-            values |= {"noise.quadratic": fields.quadratic, "noise.center": fields.center}
-        return MappingProxyType(values)
+        return values_of(self)
 
     @cached_property
     def silence(self) -> Floats:
@@ -601,7 +558,7 @@ class Scene(Frozen):
 
 def with_forces(scene: Scene, forces: Sequence[Force], robot: Robot) -> Scene:
     """The scene with other numbers in its forces, and a robot of the same joints; its noise stays."""
-    values = _forces(robot, forces, 0.0, 0.0, 0.0, 0.0)
+    values = acting_forces(robot, forces, 0.0, 0.0, 0.0, 0.0)
     servos = {servo.coordinate: servo.values[0] for servo in of_kind(values["elements"], "PositionServo")}
     actuation = scene.actuation.copy()
     for before in scene._servos:
@@ -618,17 +575,6 @@ def joints_with(values: ArrayLike, names: Sequence[str]) -> str:
     """The joints with values other than 0, in words."""
     acting = [name for name, value in zip(names, np.asarray(values).tolist(), strict=True) if value]
     return "on every joint" if acting and len(acting) == len(names) else f"on {', '.join(acting)}" if acting else "none"
-
-
-def _tables(rows: Sequence[tuple[str, Sequence[float]]]) -> dict[str, Floats]:
-    """Rows of numbers by name as one array for each name; zeros fill short rows."""
-    tables = {}
-    for name in dict.fromkeys(name for name, _ in rows):
-        own = [row for each, row in rows if each == name]
-        table = tables[name] = np.zeros((len(own), max(map(len, own))))
-        for row, numbers in zip(table, own, strict=True):
-            row[: len(numbers)] = numbers
-    return tables
 
 
 def refuse_constraints(scene: Scene, what: object) -> None:
@@ -677,178 +623,8 @@ def tangent_basis(scene: Scene, q: Floats, off: float = _OFF) -> Floats:
     return np.ascontiguousarray(basis[rank:].T)
 
 
-def same(one: Floats, other: Floats) -> bool:
-    """Whether values of scenes agree up to rounding; versions of Pinocchio may read a robot differently by as much."""
-    if one.shape != other.shape:
-        return not (one.size or other.size)
-    least = 1e-12 * max(float(np.abs(x[np.isfinite(x)]).max(initial=0.0)) for x in (one, other))
-    return bool(np.isclose(one, other, rtol=1e-9, atol=least, equal_nan=True).all())
-
-
-def differences(scene: Scene, values: Mapping[str, Floats], *, noise: bool) -> list[str]:
-    """The names of the values in which a scene differs from :attr:`Scene.values`, with ``noise`` or without."""
-    found, none = [], np.zeros(0)
-    for name in dict.fromkeys((*values, *scene.values)) if values else ():
-        before, now = values.get(name, none), scene.values.get(name, none)
-        # A CustomNoise has no numbers.
-        known = not name.startswith("noise.") or (noise and before.size and now.size)
-        if known and not same(before, now):
-            found.append(f"the robot's {name}" if name in _OF_TREE else name)
-    return found
-
-
 def require_scene(scene: object) -> Scene:
     """``scene`` itself; an InputError if it is no Scene."""
     if not isinstance(scene, Scene):
         raise InputError(f"scene must be a varpin.Scene, got {type(scene).__name__}")
     return scene
-
-
-def _gravity(gravity: ArrayLike | bool, robot: Robot) -> Floats:
-    """Gravity (3,) [m/s^2] from the argument of a scene."""
-    if isinstance(gravity, bool | np.bool_):
-        return finite_array("gravity of the robot", robot.model.gravity.linear, (3,)) if gravity else np.zeros(3)
-    given = as_floats("gravity", gravity)
-    if given.ndim == 0 and np.isfinite(given):
-        meant = f"({', '.join(f'{g:g}' for g in (0.0, 0.0, -abs(float(given))))})" if given else "False"
-        raise InputError(
-            f"gravity is a vector in world axes, z up [m/s^2], got the number {float(given):g}; did you mean "
-            f"gravity={meant}?"
-        )
-    if np.linalg.norm(vector := finite_array("gravity", given, (3,))) > _HEAVY:
-        logger.warning("gravity = %s m/s^2 is ten times that of the Earth and more: is it in mm/s^2?", vector.tolist())
-    return vector
-
-
-def _warn_of_description(robot: Robot, name: str, what: str, *, gives: bool, asked: bool, decided: bool) -> None:
-    """Log that the description gives nothing where it is asked for, or something that nobody decided about."""
-    if asked and not gives:
-        logger.warning("robot %r: %s='robot' is none, because the description gives none", robot.name, name)
-    if gives and not (asked or decided):
-        message = "robot %r: the scene leaves out the %s of its description: %s='robot' takes it, %s=%s silences this"
-        logger.warning(message, robot.name, what, name, name, 0 if name == what else "()")
-
-
-def given_constraints(
-    robot: Robot, given: Constraint | Sequence[Constraint | Literal["robot"]] | Literal["robot"] | None
-) -> tuple[Constraint, ...]:
-    """The constraints from the argument of a scene, with those of the robot's description in place of ``"robot"``."""
-    parts: Any = ("robot",) if is_one_of(given, ("robot",)) else () if given is None else given
-    if asked := isinstance(parts, list | tuple) and any(is_one_of(part, ("robot",)) for part in parts):
-        if [is_one_of(part, ("robot",)) for part in parts].count(True) > 1:
-            raise InputError("constraints has 'robot' twice")
-        own = description_constraints(robot)
-        parts = [each for part in parts for each in (own if is_one_of(part, ("robot",)) else (part,))]
-    note = "; those of a plan, such as limits and obstacles, belong to varpin.OptimalControlProblem(constraints=)"
-    found = tuple_of("constraints", parts, Constraint, note)
-    # Kinematic inputs alone are no decision on those of the description.
-    decided = given is not None and not (found and all(isinstance(part, KinematicInput) for part in found))
-    gives = bool(robot.equalities)
-    _warn_of_description(robot, "constraints", "equality constraints", gives=gives, asked=asked, decided=decided)
-    return found
-
-
-def _forces(
-    robot: Robot,
-    forces: Force | Sequence[Force],
-    damping: JointValues | Literal["robot"] | None,
-    friction: JointValues | Literal["robot"] | None,
-    stiffness: JointValues,
-    rest: JointValues,
-) -> dict[str, Any]:
-    """The attributes of a scene that follow from its forces, by name."""
-    given: tuple[Force, ...] = tuple_of("forces", forces, Force)
-    kinds = {type(force) for force in given}
-
-    def resistance(name: str, value: Any, own: Floats, *, decided: bool) -> Floats:
-        asked = isinstance(value, str)
-        if asked and value != "robot":
-            raise InputError(f"{name} must be numbers, or 'robot' for those of the robot's description, got {value!r}")
-        _warn_of_description(robot, name, name, gives=bool(own.any()), asked=asked, decided=decided)
-        values = own if asked else 0.0 if value is None else value
-        return joint_array(name, values, robot.joint_names, uniform=True)
-
-    viscous = resistance("damping", damping, robot.damping, decided=damping is not None or JointDamper in kinds)
-    # Numbers for the damping are a decision on the dry friction, too.
-    decided = friction is not None or not (damping is None or is_one_of(damping, ("robot",)))
-    dry = resistance("friction", friction, robot.friction, decided=decided or CoulombFriction in kinds)
-    # Its force would call it the level.
-    refuse_where("friction", dry, dry < 0.0, "must be >= 0")
-    short: tuple[Force, ...] = (JointSpring(stiffness, rest), JointDamper(viscous), CoulombFriction(dry))
-    acting = [(force, parts) for force in short if (parts := force.bind(robot))]
-    acting += [(force, bound_force(force, robot)) for force in given]
-    given = tuple(force for force, _ in acting)
-    bound = [each for _, parts in acting for each in parts]
-    elements = [each for each in bound if isinstance(each, Element)]
-    own_code = tuple(force for force in given if isinstance(force, CustomForce))
-    total = {kind: np.zeros(robot.dof) for kind in _SUMMED}
-    for element in elements:
-        if element.kind in total:
-            total[element.kind][element.coordinate] += element.values[0]
-    slack = np.zeros(robot.dof)
-    for c in np.flatnonzero(total["JointSpring"]):
-        springs = [element.values for element in of_kind(elements, "JointSpring") if element.coordinate == c]
-        first = springs[0][1]
-        slack[c] = first + sum(stiffness * (rest - first) for stiffness, rest in springs) / total["JointSpring"][c]
-    return {
-        "forces": given,
-        "elements": tuple(element for element in elements if element.kind != "Armature"),
-        "couplings": tuple(each for each in bound if isinstance(each, Coupling)),
-        "custom": CustomForces(own_code) if own_code else None,
-        "damping": total["JointDamper"],
-        "stiffness": total["JointSpring"],
-        "rest": slack,
-        "armature": robot.tree.armature + total["Armature"],
-    }
-
-
-def _is_input(tie: Tied) -> bool:
-    """Whether a tie is a :class:`KinematicInput`."""
-    return tie.follower == tie.leader and not tie.coefficients
-
-
-def _driven(robot: Robot, actuation: Floats, servos: Sequence[Element], inputs: Sequence[int]) -> Floats:
-    """The actuation with the columns of servos multiplied by their stiffness.
-
-    Raises:
-        InputError: A joint has two servos or kinematic inputs, or one without a control of its own with factor 1.
-    """
-    scaled, taken = actuation.copy(), set()
-    drives = [(servo.coordinate, servo.values[0], "PositionServo") for servo in servos]
-    for c, stiffness, what in [*drives, *((c, 1.0, "KinematicInput") for c in inputs)]:
-        joint, columns = robot.joint_names[c], np.flatnonzero(actuation[c])
-        if c in taken:
-            raise InputError(f"joint {joint!r} has more than one PositionServo or KinematicInput")
-        if not (len(columns) == 1 and np.array_equal(actuation[:, columns[0]], np.eye(robot.dof)[c])):
-            raise InputError(
-                f"the {what} of joint {joint!r} needs a control of its own, and no column of the actuation has a 1 at "
-                "this joint and zeros elsewhere"
-            )
-        taken.add(c)
-        scaled[c, columns] = stiffness
-    return scaled
-
-
-def _with_rates(actuation: Floats, bound: Bound) -> tuple[Floats, Bound]:
-    """The actuation with a column of zeros for the velocity of each cubic input, and the ties with these columns."""
-    columns = count(actuation.shape[1])
-    ties = tuple(tie._replace(rate=next(columns)) if tie.rate >= 0 else tie for tie in bound.rows.ties)
-    added = np.zeros((len(actuation), next(columns) - actuation.shape[1]))
-    return np.hstack([actuation, added]), bound._replace(rows=bound.rows._replace(ties=ties))
-
-
-def _actuation(robot: Robot, actuation: ArrayLike | Sequence[str] | None) -> Floats:
-    n = robot.dof
-    if actuation is None:
-        return np.eye(n)
-    if isinstance(actuation, str):
-        actuation = [actuation]
-    if isinstance(actuation, Sequence) and all(isinstance(name, str) for name in actuation):
-        names = [str(name) for name in actuation]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise InputError(f"actuation names {', '.join(map(repr, twice))} more than once")
-        return np.eye(n)[:, [robot.coordinate(name) for name in names]].copy()
-    matrix = as_floats("actuation", actuation)
-    if matrix.ndim != 2:
-        raise InputError(f"actuation must be a matrix with {n} rows, or joint names, got shape {matrix.shape}")
-    return finite_array("actuation", matrix, (n, matrix.shape[1]))

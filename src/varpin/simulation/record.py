@@ -13,7 +13,7 @@ from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import ControlError, InputError, StepError, VarpinError
 from varpin.integrators import Integrator, Segment
-from varpin.integrators.base import Failure, join
+from varpin.integrators.base import Failure, Run, join
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
@@ -104,7 +104,7 @@ class MotionRecord:
         self._within: list[Floats] = []
 
     def advance(
-        self, state: object, controls: Controls | ControlLaw, commands: Commands, most: int, steps: int
+        self, state: Run, controls: Controls | ControlLaw, commands: Commands, most: int, steps: int
     ) -> Segment:
         """Append about ``most`` steps of ``steps`` in all; a StepError with the motion so far if a function failed."""
         try:

@@ -14,7 +14,7 @@ from varpin.core.arrays import Commands
 from varpin.errors import InputError
 from varpin.finding import Finding, announce, ranked
 from varpin.integrators import Integrator
-from varpin.integrators.base import Failure
+from varpin.integrators.base import Failure, Run
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.signals.commands import open_loop
@@ -219,7 +219,7 @@ def simulate(
 
 def _roll(
     record: MotionRecord,
-    state: object,
+    state: Run,
     steps: int,
     controls: Controls | ControlLaw,
     commands: Commands,
