@@ -20,6 +20,7 @@ from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.estimation.filter import MISFIT, misfit
 from varpin.estimation.fit import LATEST, LOST, Fit, Run, Stretch, predictions, simulations
+from varpin.estimation.grid import Grid
 from varpin.estimation.log import Log, as_log
 from varpin.estimation.parameters import parameters_of
 from varpin.finding import Finding, announce
@@ -189,7 +190,8 @@ def identify(
     y, status, evaluation = fit.begin, "converged", count("evaluations", evaluations)
     try:
         if scene.processes:
-            y, status = fit.search(partial(predictions, fit, runs), y, evaluation, last=True)
+            grids = [Grid.between(log, dt) for log in matched]
+            y, status = fit.search(partial(predictions, fit, grids), y, evaluation, last=True)
         else:
             for finer in range(fit.doublings(runs), -1, -1):
                 stretches = [part for run in runs for part in run.stretches(2**finer)]
@@ -244,9 +246,10 @@ def _made(fit: Fit, y: Floats, runs: Sequence[Run], apart: Sequence[Run], status
 
 def _positions(run: Run, stretches: Sequence[Stretch], scene: Scene, late: float) -> Floats:
     """Positions at the samples (K, n) of motions from the starts of stretches; NaN where they cannot be simulated."""
-    found, u = np.full(run.log.q.shape, np.nan), run.controls(late)[0]
+    found = np.full(run.log.q.shape, np.nan)
     for each in stretches:
-        motion = each.motion(scene, u[each.begin : each.end], run.starts[each.begin])
+        u, _ = run.grid.controls(late, each.begin, each.end)
+        motion = each.motion(scene, u, run.starts[each.begin])
         if motion is not None:
             found[each.samples] = each.at_samples(motion.q, motion.v)[0]
     return found
