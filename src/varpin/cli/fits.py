@@ -153,8 +153,7 @@ def _facts(found: Identification, written: Sequence[tuple[str, Path]]) -> Table:
         ("status", found.status),
         ("delay of the controls", f"{1e3 * found.delay:.4g}{spread} ms"),
         *(("not told", sentence) for sentence in found.null_space),
-        # The log has the first.
-        *(("warning", finding) for finding in found.warnings[1:]),
+        *(("warning", finding) for finding in found.warnings),
         *written,
     ]
     return Table("\nsearch", (), rows)

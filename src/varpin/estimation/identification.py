@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -39,8 +39,10 @@ _HORIZON = 1.0
 _NOTHING = 1e-7
 # Coefficients of a combination below this share of its largest are rounding.
 _NAMED = 1e-3
-# Standard deviations of a delay, and of what fits better beyond a bound, that are told.
-_SURE = 4.0
+# Standard deviations of a delay, and residuals in units of the encoders' noise, that are told.
+_SURE, _MISFIT = 4.0, 2.0
+# Deviations by which the logs ask for less than a least value that are told: zeros with noise are nearly always nearer.
+_PULLED = 3.0
 # Doubts about a log from which no value could be right.
 _NEVER = ("dead encoder", "clock of the log")
 
@@ -216,31 +218,40 @@ def _made(fit: Fit, y: Floats, runs: Sequence[Run], apart: Sequence[Run], status
     covariance, null = _covariance(fit, slopes)
     # Where the residuals are larger than the encoders' noise, the values are less certain by as much.
     covariance = covariance * max(1.0, fit.least / len(fit.jacobian))
-    all_runs = [*runs, *apart]
-    predicted, before = ([np.full(run.log.q.shape, np.nan) for run in all_runs] for _ in range(2))
-    changes = beyond = np.zeros(P)
+    # Ctrl-C leaves out the motions and the check of the step that are not done, and keeps the values.
+    every = [*runs, *apart]
+    predicted, before = ([np.full(run.log.q.shape, np.nan) for run in every] for _ in range(2))
+    changes = np.zeros(P)
     try:
-        for k, run in enumerate(all_runs):
+        for k, run in enumerate(every):
             stretches = run.settled(scene, late)
             predicted[k] = _positions(run, stretches, scene, late)
             before[k] = _positions(run, stretches, fit.of.scene, 0.0 if fit.delay is None else fit.delay)
-        if not fit.of.scene.processes:
-            changes, beyond = _step_error(fit, runs, y)
+        if status != "interrupted" and not fit.of.scene.processes:
+            changes = _step_error(fit, runs, y)
     except KeyboardInterrupt:
-        # The values are known; what is left are their motions.
         status = "interrupted"
-    residuals = tuple(run.log.q - own for run, own in zip(all_runs, predicted, strict=True))
-    deviation = float(np.sqrt(covariance[P, P])) if fit.delay is None else 0.0
+    residuals = [run.log.q - own for run, own in zip(every, predicted, strict=True)]
     known, of = len(runs), fit.of
-    motions: dict[str, Any] = {"predicted": predicted[:known], "predicted_before": before[:known]}
-    motions |= {"residuals": residuals[:known], "held_out": residuals[known:], "logs": [run.log for run in runs]}
     made = Identification(
-        names=of.names, values=values, start=of.values, units=of.units, covariance=covariance[:P, :P], delay=late,
-        delay_deviation=deviation, null_space=null, scene=scene, status=status,
-        **{name: tuple(each) for name, each in motions.items()},
-    )  # fmt: skip
-    found = tuple(_doubts(fit, made, changes, beyond))
-    announce(logger, fit.of.scene.announced, fit.dt, found)
+        names=of.names,
+        values=values,
+        start=of.values,
+        units=of.units,
+        covariance=covariance[:P, :P],
+        delay=late,
+        delay_deviation=float(np.sqrt(covariance[P, P])) if fit.delay is None else 0.0,
+        null_space=null,
+        scene=scene,
+        logs=tuple(run.log for run in runs),
+        predicted=tuple(predicted[:known]),
+        predicted_before=tuple(before[:known]),
+        residuals=tuple(residuals[:known]),
+        held_out=tuple(residuals[known:]),
+        status=status,
+    )
+    found = tuple(_doubts(fit, made, changes))
+    announce(logger, of.scene.announced, fit.dt, found)
     return made.changed(warnings=(*found, *(each for run in runs for each in run.log.warnings)))
 
 
@@ -316,25 +327,13 @@ def _step_error(fit: Fit, runs: Sequence[Run], y: Floats) -> tuple[Floats, Float
     return slopes @ (steps[0] - steps[1]), -slopes @ steps[0]
 
 
-def _doubts(fit: Fit, made: Identification, changes: Floats, beyond: Floats) -> list[Finding]:
-    found = []
+def _doubts(fit: Fit, made: Identification, changes: Floats) -> Iterator[Finding]:
+    """What is doubtful about the values, the worst first; ``changes`` (P,) are those by half the step."""
     if fit.least >= LOST**2:
         text = "motions with these values cannot be simulated: a column or its unit is wrong, or dt is too long"
-        found.append(Finding("lost", text))
-    squares = [np.square(own / fit.deviation) for own in made.residuals]
-    together = np.concatenate(squares)
-    there = np.isfinite(together)
-    by_joint = np.sqrt(np.where(there, together, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1))
-    worst = int(np.argmax(by_joint))
-    if fit.of.scene.processes:
-        found += misfit(float(np.sqrt(fit.least / len(fit.jacobian))))
-    elif not by_joint[worst] <= MISFIT:
-        joint = fit.of.scene.robot.joint_names[worst]
-        text = (
-            f"the residuals of {joint!r} are {by_joint[worst]:.3g} times q_noise: something acts that is no "
-            "parameter (friction, a payload elsewhere), or its column, clock or q_noise is wrong"
-        )
-        found.append(Finding("misfit", text, joint, value=float(by_joint[worst])))
+        yield Finding("lost", text)
+    misfit = list(_misfit(fit, made))
+    yield from misfit
     by_noise = np.divide(np.abs(changes), made.deviations, out=np.zeros_like(changes), where=made.deviations > 0.0)
     k = int(np.argmax(by_noise))
     if not by_noise[k] <= 1.0:
@@ -343,21 +342,50 @@ def _doubts(fit: Fit, made: Identification, changes: Floats, beyond: Floats) -> 
             f"half the step changes {made.names[k]} by {changes[k]:.3g} {made.units[k]}, {by_noise[k]:.3g} standard "
             f"deviations: take a smaller dt{higher}"
         )
-        found.append(Finding("step", text, value=float(changes[k]), unit=made.units[k]))
-    beyond = np.where(made.values <= fit.of.least, -beyond, 0.0)
-    k = int(np.argmax(beyond - _SURE * made.deviations))
-    if beyond[k] > _SURE * made.deviations[k]:
-        text = f"{made.names[k]} is at its least value, and {beyond[k]:.3g} {made.units[k]} less would fit better"
-        found.append(Finding("bound", f"{text}: something acts that is no parameter", value=float(beyond[k])))
+        yield Finding("step", text, value=float(changes[k]), unit=made.units[k])
     if made.status == "evaluations":
-        found.append(Finding("evaluations", "the search ended at its most evaluations: evaluations= allows more"))
+        yield Finding("evaluations", "the search ended at its most evaluations: evaluations= allows more")
+    if ended := _ended(fit):
+        text = f"{', '.join(ended)} ended at the least value, and the logs ask for less: something else acts"
+        yield Finding("bound", text)
     if fit.delay is None and abs(made.delay) > max(_SURE * made.delay_deviation, 1e-2 * fit.dt):
         text = f"the controls act {1e3 * made.delay:.3g} ms later than the logs say, which the values allow for"
-        if any(each.kind == "misfit" for each in found):
+        if misfit:
             text = f"a delay of {1e3 * made.delay:.3g} ms fits best, or stands for what the scene lacks"
         if abs(made.delay) >= LATEST:
             text = (
                 f"the delay of the controls is {LATEST:g} s or more, beyond what is looked for: give delay= or shift t"
             )
-        found.append(Finding("delay", text, value=made.delay, unit="s"))
-    return found
+        yield Finding("delay", text, value=made.delay, unit="s")
+
+
+def _misfit(fit: Fit, made: Identification) -> Iterator[Finding]:
+    """Residuals, or innovations under noise, that are larger than their noise."""
+    if fit.of.scene.processes:
+        over = float(np.sqrt(fit.least / len(fit.jacobian)))
+        if not over <= _MISFIT:
+            text = (
+                f"the innovations are {over:.3g} times what the scene's noise and q_noise explain: something else acts"
+            )
+            yield Finding("misfit", text, value=over)
+        return
+    squares = np.square(np.concatenate(made.residuals) / fit.deviation)
+    there = np.isfinite(squares)
+    by_joint = np.sqrt(np.where(there, squares, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1))
+    worst = int(np.argmax(by_joint))
+    if not by_joint[worst] <= _MISFIT:
+        joint = fit.of.scene.robot.joint_names[worst]
+        text = (
+            f"the residuals of {joint!r} are {by_joint[worst]:.3g} times q_noise: something acts that is no "
+            "parameter (friction, a payload elsewhere), or its column, clock or q_noise is wrong"
+        )
+        yield Finding("misfit", text, joint, value=float(by_joint[worst]))
+
+
+def _ended(fit: Fit) -> list[str]:
+    """Parameters at their least values which the logs hold there, by more than noise would."""
+    sizes = np.maximum(np.linalg.norm(fit.jacobian, axis=0), np.finfo(float).tiny)
+    # By how many of its deviations each would be less if it were alone.
+    less = fit.rest @ fit.jacobian / sizes / max(1.0, np.sqrt(fit.least / len(fit.jacobian)))
+    held = (fit.best <= fit.bounds[0]) & (less > _PULLED)
+    return [name for name, told in zip(fit.of.names, held, strict=False) if told]
