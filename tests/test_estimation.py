@@ -396,18 +396,18 @@ def test_a_right_log_is_not_doubted(load, caplog):
     assert not caplog.messages
 
 
-def test_a_filter_tells_of_innovations_that_are_too_large(load, caplog):
-    size, strength, damping = ARMS["ur5"]
-    scene = scene_of(load("ur5"), strength, damping)
-    paths, _, u = true_motions(scene, size, steps=60, paths=5)
-    for seed, q in enumerate(paths):
-        assert not vp.kalman_filter(scene, log_of(q, u, seed=seed), q_noise=ENCODER).warnings
-    sure, log = scene_of(load("ur5"), np.array(strength) / 20, damping), log_of(paths[0], u)
-    for scene_, noise in ((sure, ENCODER), (scene, ENCODER / 5)):
-        found = vp.smooth(scene_, log, q_noise=noise)
-        mean = f"{found.nis().sum() / 61:.3g}"
-        assert naming(found.warnings, "nis()", mean, "6"), found.warnings
-        assert naming(caplog.messages, mean)
+@pytest.mark.parametrize(("intensity", "told"), [(0.05, False), (0.01, True), (0.005, True)])
+def test_innovations_that_noise_does_not_explain_are_told(intensity, told, caplog):
+    robot, rest = vp.planar_chain(2), np.zeros(2)
+    arm = vp.Scene(robot, gravity=np.zeros(3), damping=0.5, noise=vp.AdditiveNoise(0.05))
+    for seed in range(1 if told else 20):
+        motion = vp.simulate(arm, rest, rest, dt=1e-2, steps=100, rng=seed, check=False)
+        encoders = motion.q + ENCODER * np.random.default_rng(seed).standard_normal(motion.q.shape)
+        log = vp.Log(motion.t, encoders, np.vstack([motion.u, motion.u[-1:]]))
+        scene = vp.Scene(robot, gravity=np.zeros(3), damping=0.5, noise=vp.AdditiveNoise(intensity))
+        found = vp.smooth(scene, log, q_noise=ENCODER)
+        assert bool(naming(found.warnings, "innovations", f"{found.nis().mean():.3g}", "2")) == told
+    assert bool(caplog.messages) == told
 
 
 def test_what_a_filter_refuses():

@@ -184,47 +184,24 @@ def kalman_filter(
         LinearizationError: A step from an estimate has no solution.
     """
     log = as_log(log).matched(require_scene(scene))
-    found = filtered(scene, log, q_noise, v_noise, external, dt, q0, v0, covariance, integrator)
-    over = np.sqrt(found.nis().sum() / max(1, np.isfinite(found.innovations).sum()))
-    told = misfit(float(over))
+    start = q0, v0, covariance
+    found = filtered(scene, Grid.between(log, dt), q_noise, v_noise, external=external, start=start, method=integrator)
+    there, total = np.isfinite(found.innovations), float(found.nis().sum())
+    numbers, samples = int(there.sum()), int(there.any(axis=1).sum())
+    told = tuple(
+        doubt.about(f"the mean of nis() is {total / samples:.3g}, and {numbers / samples:.3g} if all is right: ")
+        for doubt in misfit(total, numbers)
+    )
     announce(logger, scene.announced, float(np.median(np.diff(log.t))), told)
     return found.changed(warnings=(*told, *log.warnings))
 
 
-def misfit(over: float) -> tuple[Finding, ...]:
-    """The warning of innovations that are so many times their standard deviations."""
-    if over <= MISFIT:
-        return ()
-    text = f"the innovations are {over:.3g} times what the scene's noise and q_noise explain: something else acts"
-    return (Finding("misfit", text, value=over),)
-
-
-def filtered(
-    scene: Scene,
-    log: Log,
-    q_noise: JointValues,
-    v_noise: JointValues | None = None,
-    external: tuple[JointValues, float] | None = None,
-    dt: float | None = None,
-    q0: JointValues | None = None,
-    v0: JointValues | None = None,
-    covariance: ArrayLike | None = None,
-    integrator: Integrator | None = None,
-) -> Estimate:
-    """As :func:`kalman_filter` for a log in the scene's order, without a word about what is doubtful."""
-    refuse_constraints(scene, "a Kalman filter")
-    if scene.noise.velocity_dependent:
-        raise InputError("a Kalman filter does not take noise whose fields depend on the velocity")
-    if not scene.processes and external is None:
-        raise InputError(
-            "the scene has no noise, so that a filter would trust it more than any sample: varpin.Scene(robot, "
-            "noise=varpin.AdditiveNoise(intensity)) says how strong the forces are that it does not know"
-        )
-    start = q0, v0, covariance
-    found = filtered(scene, Grid.between(log, dt), q_noise, v_noise, external=external, start=start, method=integrator)
-    doubts = tuple(_doubts(found))
-    announce(logger, scene.announced, float(found.given.h[0]), doubts)
-    return found.changed(warnings=(*log.warnings, *doubts))
+def misfit(total: float, numbers: int) -> Iterator[Finding]:
+    """The warning of innovations whose squares, in units of their variances, have a ``total`` that is too large."""
+    if not total <= _MISFIT * numbers and not chdtrc(numbers, total) > _RARE:
+        over = float(np.sqrt(total / numbers))
+        text = f"the innovations are {over:.3g} times what the scene's noise and q_noise explain: something else acts"
+        yield Finding("misfit", text, value=over)
 
 
 def filtered(
@@ -237,7 +214,15 @@ def filtered(
     start: tuple[JointValues | None, JointValues | None, ArrayLike | None] = (None, None, None),
     method: Integrator | None,
 ) -> Estimate:
-    """:func:`kalman_filter` of a log that fits the scene, with samples at nodes of a grid, and without its doubts."""
+    """:func:`kalman_filter` of a log in the scene's order with samples at nodes of a grid, without its doubts."""
+    refuse_constraints(scene, "a Kalman filter")
+    if scene.noise.velocity_dependent:
+        raise InputError("a Kalman filter does not take noise whose fields depend on the velocity")
+    if not scene.processes and external is None:
+        raise InputError(
+            "the scene has no noise, so that a filter would trust it more than any sample: varpin.Scene(robot, "
+            "noise=varpin.AdditiveNoise(intensity)) says how strong the forces are that it does not know"
+        )
     log, joints, n = grid.log, scene.robot.joint_names, scene.robot.dof
     measured, variance = log.q, variances("q_noise", q_noise, joints)
     q, first, rate, P = _first_samples(log, variance)
@@ -267,18 +252,6 @@ def filtered(
     states = _in_velocities(scene, found.state, found.covariance, variational=method.variational)
     own: dict[str, Any] = {"joint_names": joints, "integrator": str(method), "variational": method.variational}
     return Estimate(log.t, forward=found, given=seen, **own, **states)
-
-
-def _doubts(found: Estimate) -> Iterator[Finding]:
-    """Innovations that are too large to be those of a right scene."""
-    there, total = np.isfinite(found.innovations), float(found.nis().sum())
-    numbers, samples = int(there.sum()), int(there.any(axis=1).sum())
-    if not total <= _MISFIT * numbers and chdtrc(numbers, total) < _RARE:
-        text = (
-            f"the mean of nis() is {total / samples:.3g}, and {numbers / samples:.3g} if all is right: the scene's "
-            "noise or the encoders' is larger than given, or the scene lacks a force"
-        )
-        yield Finding("misfit", text, value=total / samples)
 
 
 def smooth(scene: Scene, log: Log | Trajectory, *, q_noise: JointValues, **options: Any) -> Estimate:

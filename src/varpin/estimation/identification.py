@@ -18,7 +18,7 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
-from varpin.estimation.filter import MISFIT, misfit
+from varpin.estimation.filter import misfit
 from varpin.estimation.fit import LATEST, LOST, Fit, Run, Stretch, predictions, simulations
 from varpin.estimation.grid import Grid
 from varpin.estimation.log import Log, as_log
@@ -313,8 +313,8 @@ def _sentences(null: Floats, names: Sequence[str]) -> list[str]:
     return found
 
 
-def _step_error(fit: Fit, runs: Sequence[Run], y: Floats) -> tuple[Floats, Floats]:
-    """What half the step, and no bounds, would change in the values (P,), to first order."""
+def _step_error(fit: Fit, runs: Sequence[Run], y: Floats) -> Floats:
+    """What half the step changes in the values (P,), to first order."""
     finer = copy(fit)
     finer.dt *= 0.5
     steps = []
@@ -323,8 +323,8 @@ def _step_error(fit: Fit, runs: Sequence[Run], y: Floats) -> tuple[Floats, Float
         r, J = simulations(each, [part for run in of for part in run.settled(scene, fit.late(y))], y)
         both, slopes = fit.with_prior(r, J, y)
         steps.append(np.linalg.lstsq(slopes, both, rcond=_NOTHING)[0])
-    slopes = fit.values(y)[1]
-    return slopes @ (steps[0] - steps[1]), -slopes @ steps[0]
+    change: Floats = fit.values(y)[1] @ (steps[0] - steps[1])
+    return change
 
 
 def _doubts(fit: Fit, made: Identification, changes: Floats) -> Iterator[Finding]:
@@ -332,8 +332,8 @@ def _doubts(fit: Fit, made: Identification, changes: Floats) -> Iterator[Finding
     if fit.least >= LOST**2:
         text = "motions with these values cannot be simulated: a column or its unit is wrong, or dt is too long"
         yield Finding("lost", text)
-    misfit = list(_misfit(fit, made))
-    yield from misfit
+    misfits = list(_misfit(fit, made))
+    yield from misfits
     by_noise = np.divide(np.abs(changes), made.deviations, out=np.zeros_like(changes), where=made.deviations > 0.0)
     k = int(np.argmax(by_noise))
     if not by_noise[k] <= 1.0:
@@ -350,7 +350,7 @@ def _doubts(fit: Fit, made: Identification, changes: Floats) -> Iterator[Finding
         yield Finding("bound", text)
     if fit.delay is None and abs(made.delay) > max(_SURE * made.delay_deviation, 1e-2 * fit.dt):
         text = f"the controls act {1e3 * made.delay:.3g} ms later than the logs say, which the values allow for"
-        if misfit:
+        if misfits:
             text = f"a delay of {1e3 * made.delay:.3g} ms fits best, or stands for what the scene lacks"
         if abs(made.delay) >= LATEST:
             text = (
@@ -362,12 +362,7 @@ def _doubts(fit: Fit, made: Identification, changes: Floats) -> Iterator[Finding
 def _misfit(fit: Fit, made: Identification) -> Iterator[Finding]:
     """Residuals, or innovations under noise, that are larger than their noise."""
     if fit.of.scene.processes:
-        over = float(np.sqrt(fit.least / len(fit.jacobian)))
-        if not over <= _MISFIT:
-            text = (
-                f"the innovations are {over:.3g} times what the scene's noise and q_noise explain: something else acts"
-            )
-            yield Finding("misfit", text, value=over)
+        yield from misfit(fit.least, len(fit.jacobian))
         return
     squares = np.square(np.concatenate(made.residuals) / fit.deviation)
     there = np.isfinite(squares)
