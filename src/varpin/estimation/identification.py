@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.linalg import qr
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
@@ -290,26 +291,20 @@ def _covariance(fit: Fit, slopes: Floats) -> tuple[Floats, tuple[str, ...]]:
 
 def _sentences(null: Floats, names: Sequence[str]) -> list[str]:
     """Combinations (k, P) that nothing depends on, in words: each has a parameter that no other has."""
-    found = []
-    rows = null / np.abs(null).max(axis=1, keepdims=True, initial=1e-300)
-    for k in range(len(rows)):
-        column = int(np.argmax(np.abs(rows[k])))
-        if not abs(rows[k, column]) > _NAMED:
-            continue
-        rows[k] /= rows[k, column]
-        for other in range(len(rows)):
-            if other != k:
-                rows[other] -= rows[other, column] * rows[k]
-    for row in rows:
-        own = int(np.argmax(np.isclose(row, 1.0)))
-        rest = [c for c in np.argsort(-np.abs(row)) if c != own and abs(row[c]) > _NAMED]
+    found: list[str] = []
+    rows = null / np.abs(null).max(axis=1, keepdims=True, initial=0.0)
+    if not len(rows):
+        return found
+    own = qr(rows, mode="r", pivoting=True)[1][: len(rows)]
+    for k, row in zip(own, np.linalg.solve(rows[:, own], rows), strict=True):
+        rest = [c for c in np.argsort(-np.abs(row)) if c not in own and abs(row[c]) > _NAMED]
         if not rest:
-            found.append(f"{names[own]}: the logs do not depend on it")
+            found.append(f"{names[k]}: the logs do not depend on it")
         elif len(rest) == 1:
-            found.append(f"{names[own]} and {names[rest[0]]}: only {names[rest[0]]} {-row[rest[0]]:+.4g} {names[own]}")
+            found.append(f"{names[k]} and {names[rest[0]]}: only {names[rest[0]]} {-row[rest[0]]:+.4g} {names[k]}")
         else:
             trade = ", ".join(f"{row[c]:+.4g} {names[c]}" for c in rest)
-            found.append(f"{names[own]}: a change of 1 is undone by {trade}")
+            found.append(f"{names[k]}: a change of 1 is undone by {trade}")
     return found
 
 
