@@ -117,19 +117,55 @@ def test_uneven_samples_and_missing_ones(integrator):
     assert within(found, TRUTH, 5.0)
 
 
-def test_prediction_errors_under_noise():
-    strength = 0.02
+STRENGTH = 0.02
+
+
+@functools.cache
+def shaken():
+    """Positions each 1 ms of the arm under noise, and its torques each 10 ms."""
     robot = vp.load_robot("ur5", payload=vp.Payload("tool0", 2.0))
-    scene = vp.Scene(robot, damping=DAMPING, noise=vp.AdditiveNoise(strength))
+    scene = vp.Scene(robot, damping=DAMPING, noise=vp.AdditiveNoise(STRENGTH))
     _, u = motion(duration=1.5)
-    shaken = vp.simulate(scene, MIDDLE, np.zeros(6), dt=1e-3, steps=1500, controls=np.repeat(u[:-1], 10, axis=0), rng=3,
-                         integrator=vp.Midpoint(kick="held"), check=False)  # fmt: skip
-    q = shaken.q[::10] + NOISE * np.random.default_rng(8).standard_normal(u.shape)
-    found = vp.identify(
-        start(noise=vp.AdditiveNoise(strength)), vp.Log(1e-2 * np.arange(len(q)), q, u), NAMES, q_noise=NOISE
-    )
+    made = vp.simulate(scene, MIDDLE, np.zeros(6), dt=1e-3, steps=1500, controls=np.repeat(u[:-1], 10, axis=0), rng=3,
+                       integrator=vp.Midpoint(kick="held"), check=False)  # fmt: skip
+    return made.q, u
+
+
+def under_noise(t, q, u, **options):
+    return vp.identify(start(noise=vp.AdditiveNoise(STRENGTH)), vp.Log(t, q, u), NAMES, q_noise=NOISE, **options)
+
+
+def test_prediction_errors_under_noise():
+    q, u = shaken()
+    q = q[::10] + NOISE * np.random.default_rng(8).standard_normal(u.shape)
+    found = under_noise(1e-2 * np.arange(len(q)), q, u)
     assert within(found, TRUTH)
     assert (found.deviations < 0.2 * TRUTH).all()
+
+
+def test_rows_that_are_missing_under_noise_are_as_rows_of_nan():
+    q, u = shaken()
+    q = q[::10] + NOISE * np.random.default_rng(8).standard_normal(u.shape)
+    t, kept = 1e-2 * np.arange(len(q)), np.delete(np.arange(len(q)), [20, 40, 42, 77])
+    # What the log does not have of the torques is as before them.
+    held = u[np.repeat(kept, np.diff(np.r_[kept, len(q)]))]
+    gaps = np.full_like(q, np.nan)
+    gaps[kept] = q[kept]
+    few, whole = (under_noise(*given, delay=0.0) for given in ((t[kept], q[kept], u[kept]), (t, gaps, held)))
+    np.testing.assert_allclose(few.values, whole.values, rtol=1e-6)
+    np.testing.assert_allclose(few.deviations, whole.deviations, rtol=1e-6)
+
+
+@pytest.mark.parametrize("dt", [None, 4e-3])
+def test_an_uneven_clock_under_noise(dt):
+    q, u = shaken()
+    rng = np.random.default_rng(5)
+    at = np.union1d(np.sort(rng.choice(1500, 140, replace=False)), np.arange(0, 1500, 10))
+    encoders = q[at] + NOISE * rng.standard_normal((len(at), 6))
+    found = under_noise(1e-3 * at, encoders, u[at // 10], dt=dt)
+    assert within(found, TRUTH)
+    assert found.delay == pytest.approx(0.0, abs=4.0 * found.delay_deviation)
+    assert not found.warnings
 
 
 def test_what_logs_do_not_tell():
@@ -238,6 +274,8 @@ def test_ctrl_c_after_the_search_keeps_its_values(monkeypatch):
     assert found.status == "interrupted"
     assert within(found, TRUTH)
     assert np.isfinite(found.residuals[0]).all()
+    monkeypatch.setattr("varpin.estimation.fit.Run.settled", interrupted)
+    np.testing.assert_array_equal(vp.identify(start(), log(), NAMES, q_noise=NOISE).values, found.values)
 
 
 def test_a_value_at_its_bound_is_told_where_less_would_fit():

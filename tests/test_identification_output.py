@@ -179,7 +179,10 @@ def test_the_command_tells_what_it_could_not_find(swings, capsys):
     assert main([*words, "payload:b", "inertia:b:m"]) == 0
     assert not unnamed(" ".join(capsys.readouterr().out.split()), "not told", "payload:b", "inertia:b:m")
     assert main([*words, "--evaluations", "1"]) == 3
-    assert not unnamed(capsys.readouterr().err, "not converged", "evaluations")
+    shown = capsys.readouterr()
+    assert not unnamed(shown.err, "not converged", "evaluations")
+    # All warnings, also that which the log has.
+    assert not unnamed(" ".join(shown.out.split()), "times q_noise", "the search ended at its most evaluations")
     for more, facts in (
         (["damper"], ("'damper'", "damping")),
         (["--save", "a.npz"], ("--save", ".urdf", "'a.npz'")),

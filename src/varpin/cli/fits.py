@@ -72,7 +72,9 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
 def _identify(request: argparse.Namespace, errors: Console) -> int:
     from varpin.estimation import Log, identify  # noqa: PLC0415 - most commands do not need SciPy's optimizers
 
-    files = files_of(request, ("save", (".urdf",), _save), ("plot", PICTURES, _plot))
+    files = files_of(
+        request, ("save", (".urdf",), lambda path, found: found.save_urdf(path)), ("plot", PICTURES, _plot)
+    )
     scene = _scene(request)
     logs, apart = ([Log.load(path) for path in paths] for paths in (request.logs, request.held_out))
     options: dict[str, Any] = {name: getattr(request, name) for name in ("delay", "dt", "horizon", "evaluations")}
@@ -108,10 +110,6 @@ def _scene(request: argparse.Namespace) -> Scene:
     robot = load_robot(request.robot, **robot_options(request))
     forces: dict[str, Any] = {name: values_of(name, getattr(request, name)) for name in ("damping", "friction")}
     return Scene(robot, gravity=request.gravity, **forces)
-
-
-def _save(path: Path, found: Identification) -> None:
-    found.save_urdf(path)
 
 
 def _plot(path: Path, found: Identification) -> None:
@@ -153,8 +151,7 @@ def _facts(found: Identification, written: Sequence[tuple[str, Path]]) -> Table:
         ("status", found.status),
         ("delay of the controls", f"{1e3 * found.delay:.4g}{spread} ms"),
         *(("not told", sentence) for sentence in found.null_space),
-        # The log has the first.
-        *(("warning", finding) for finding in found.warnings[1:]),
+        *(("warning", finding) for finding in found.warnings),
         *written,
     ]
     return Table("\nsearch", (), rows)

@@ -6,6 +6,7 @@ Equations (K1) and (K2) of docs/mathematics.md.
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,10 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
+from scipy.special import chdtrc
 
 from varpin.arrays import Floats
 from varpin.core.arrays import FilterArrays, FilterLog
 from varpin.errors import InputError
+from varpin.estimation.grid import Grid
 from varpin.estimation.log import Log, as_log
 from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
@@ -30,15 +33,9 @@ from varpin.trajectory import Trajectory
 # Standard deviations of a start that is not given, in units of those of the first two samples: it then counts for 1e-4
 # of a sample. Much wider ones lose digits, 1e-16 times their square.
 _WIDE = 100.0
-# Longest step where none is given, in usual intervals of the log: one step from sample to sample though the clock
-# jitters, and more over gaps.
-_JITTER = 1.5
-# Excess of an interval over a multiple of the step that makes no further step: rounding.
-_ROUNDING = 1e-6
-# Steps between two samples that are too many: they take hours.
-_MOST = 1e9
-# Innovations in units of their standard deviations that are told: of right models the mean of a hundred is 1 +- 0.07.
-MISFIT = 2.0
+# Mean square of the innovations, in what it is if all is right, that is told, unless it is less rare than this among
+# samples of a right scene.
+_MISFIT, _RARE = 2.0, 1e-9
 
 logger = logging.getLogger(__name__)
 
@@ -187,34 +184,37 @@ def kalman_filter(
         LinearizationError: A step from an estimate has no solution.
     """
     log = as_log(log).matched(require_scene(scene))
-    found = filtered(scene, log, q_noise, v_noise, external, dt, q0, v0, covariance, integrator)
-    over = np.sqrt(found.nis().sum() / max(1, np.isfinite(found.innovations).sum()))
-    told = misfit(float(over))
+    start = q0, v0, covariance
+    found = filtered(scene, Grid.between(log, dt), q_noise, v_noise, external=external, start=start, method=integrator)
+    there, total = np.isfinite(found.innovations), float(found.nis().sum())
+    numbers, samples = int(there.sum()), int(there.any(axis=1).sum())
+    told = tuple(
+        doubt.about(f"the mean of nis() is {total / samples:.3g}, and {numbers / samples:.3g} if all is right: ")
+        for doubt in misfit(total, numbers)
+    )
     announce(logger, scene.announced, float(np.median(np.diff(log.t))), told)
     return found.changed(warnings=(*told, *log.warnings))
 
 
-def misfit(over: float) -> tuple[Finding, ...]:
-    """The warning of innovations that are so many times their standard deviations."""
-    if over <= MISFIT:
-        return ()
-    text = f"the innovations are {over:.3g} times what the scene's noise and q_noise explain: something else acts"
-    return (Finding("misfit", text, value=over),)
+def misfit(total: float, numbers: int) -> Iterator[Finding]:
+    """The warning of innovations whose squares, in units of their variances, have a ``total`` that is too large."""
+    if not total <= _MISFIT * numbers and not chdtrc(numbers, total) > _RARE:
+        over = float(np.sqrt(total / numbers))
+        text = f"the innovations are {over:.3g} times what the scene's noise and q_noise explain: something else acts"
+        yield Finding("misfit", text, value=over)
 
 
 def filtered(
     scene: Scene,
-    log: Log,
+    grid: Grid,
     q_noise: JointValues,
-    v_noise: JointValues | None = None,
+    v_noise: JointValues | None,
+    *,
     external: tuple[JointValues, float] | None = None,
-    dt: float | None = None,
-    q0: JointValues | None = None,
-    v0: JointValues | None = None,
-    covariance: ArrayLike | None = None,
-    integrator: Integrator | None = None,
+    start: tuple[JointValues | None, JointValues | None, ArrayLike | None] = (None, None, None),
+    method: Integrator | None,
 ) -> Estimate:
-    """As :func:`kalman_filter` for a log in the scene's order, without a word about what is doubtful."""
+    """:func:`kalman_filter` of a log in the scene's order with samples at nodes of a grid, without its doubts."""
     refuse_constraints(scene, "a Kalman filter")
     if scene.noise.velocity_dependent:
         raise InputError("a Kalman filter does not take noise whose fields depend on the velocity")
@@ -223,7 +223,7 @@ def filtered(
             "the scene has no noise, so that a filter would trust it more than any sample: varpin.Scene(robot, "
             "noise=varpin.AdditiveNoise(intensity)) says how strong the forces are that it does not know"
         )
-    joints, n = scene.robot.joint_names, scene.robot.dof
+    log, joints, n = grid.log, scene.robot.joint_names, scene.robot.dof
     measured, variance = log.q, variances("q_noise", q_noise, joints)
     q, first, rate, P = _first_samples(log, variance)
     if v_noise is not None:
@@ -231,12 +231,14 @@ def filtered(
             raise InputError("v_noise is given, and the log has no velocities v")
         measured = np.concatenate([log.q, log.v], axis=1)
         variance = np.concatenate([variance, variances("v_noise", v_noise, joints)])
+    q0, v0, covariance = start
     first = first if q0 is None else joint_array("q0", q0, joints)
     rate = rate if v0 is None else joint_array("v0", v0, joints)
     if covariance is not None:
         P = require_covariance(finite_array("covariance", covariance, (2 * n, 2 * n)))
-    parts, h = _steps(log.t, dt)
-    method = given_integrator(integrator) or usual_integrator(scene, first, rate, float(h.max()), noisy=False)
+    parts = np.diff(grid.at).astype(np.int64)
+    h = np.diff(log.t) / parts
+    method = given_integrator(method) or usual_integrator(scene, first, rate, float(h.max()), noisy=False)
     mean, P = _of_state(scene, first, rate, P, variational=method.variational)
     strength, kept = np.zeros(n), np.zeros(len(h))
     if external is not None:
@@ -279,16 +281,6 @@ def _external(given: tuple[JointValues, float], joints: tuple[str, ...], h: Floa
         raise InputError(f"external must be (standard deviation [N m or N], time [s]), got {given!r}")
     strength = variances("external: standard deviation", given[0], joints)
     return strength, np.exp(-h / positive("external: time", given[1], "s"))
-
-
-def _steps(t: Floats, dt: float | None) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.int64]], Floats]:
-    """The number of steps (K - 1,) in each interval, and their length [s]."""
-    intervals = np.diff(t)
-    longest = _JITTER * float(np.median(intervals)) if dt is None else positive("dt", dt, "s")
-    parts = np.maximum(1, np.ceil(intervals / longest - _ROUNDING))
-    if not parts.max() < _MOST:
-        raise InputError(f"dt = {longest:g} s gives {parts.max():.3g} steps between two samples: take a longer one")
-    return parts.astype(np.int64), intervals / parts
 
 
 def _first_samples(log: Log, variance: Floats) -> tuple[Floats, Floats, Floats, Floats]:

@@ -6,28 +6,30 @@ Equation (I1) of docs/mathematics.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import lsq_linear
 
 from varpin.arrays import Floats
 from varpin.errors import InputError, LinearizationError, RobotError, SingularMassMatrix
 from varpin.estimation.consistency import Body
-from varpin.estimation.filter import filtered, variances
+from varpin.estimation.filter import Estimate, filtered, variances
+from varpin.estimation.grid import Grid
 from varpin.estimation.log import GAP, Log
 from varpin.estimation.parameters import INERTIAL, Parameters
 from varpin.estimation.sensitivity import motion_map
-from varpin.integrators import Integrator
+from varpin.integrators import Integrator, Segment
 from varpin.integrators.base import Varied
 from varpin.linearization import linearize_steps
 from varpin.mechanics.scene import Scene
 from varpin.signals.commands import open_loop
-from varpin.simulation.record import rollout
+from varpin.simulation.record import rollout, trajectory_of
 from varpin.support.checks import JointValues
-from varpin.trajectory import Trajectory
+from varpin.trajectory import StepStatistics, Trajectory
 
 # Shortest stretches [s], with which the search begins, before each is twice as long: from a scene without friction or
 # payload, motions of a second are too far from the log to lead back.
@@ -48,39 +50,40 @@ LATEST = 0.1
 # Damping of a step in units of the squared column sizes: at first and after a step that was not right, where steps are,
 # and where no step helps any more.
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-12, 1e6
+# Steps of a filter whose lengths differ by less than this share have their derivatives in parameters together: these
+# are then off by about that share, and the search is slower by as much.
+_ALIKE = 1e-3
 # Residual in units of the noise that stands for a motion that cannot be simulated.
 LOST = 1e8
 
 
+@dataclass(eq=False)
 class Fit:
     """What all evaluations share: y are coordinates of the parameters, then the delay if it is unknown."""
 
-    def __init__(
-        self,
-        of: Parameters,
-        integrator: Integrator,
-        dt: float,
-        horizon: float,
-        q_noise: JointValues,
-        v_noise: JointValues | None,
-        delay: float | None,
-        callback: Callable[[int, float], None] | None,
-    ) -> None:
-        self.of, self.integrator, self.dt, self.delay, self.callback = of, integrator, dt, delay, callback
-        self.q_noise, self.v_noise, self.horizon = q_noise, v_noise, horizon
-        if not horizon > 0.0:
-            raise InputError(f"horizon must be positive [s], or np.inf for whole logs, got {horizon:g}")
-        names = of.scene.robot.joint_names
-        self.deviation = np.sqrt(variances("q_noise", q_noise, names))
-        self.v_deviation = None if v_noise is None else np.sqrt(variances("v_noise", v_noise, names))
+    of: Parameters
+    integrator: Integrator
+    dt: float
+    horizon: float
+    q_noise: JointValues
+    v_noise: JointValues | None
+    delay: float | None
+    callback: Callable[[int, float], None] | None
+
+    def __post_init__(self) -> None:
+        if not self.horizon > 0.0:
+            raise InputError(f"horizon must be positive [s], or np.inf for whole logs, got {self.horizon:g}")
+        of, joints = self.of, self.of.scene.robot.joint_names
+        self.deviation = np.sqrt(variances("q_noise", self.q_noise, joints))
+        self.v_deviation = None if self.v_noise is None else np.sqrt(variances("v_noise", self.v_noise, joints))
         self.bodies = _bodies(of)
         self.prior = [c for columns, _ in self.bodies for c in columns]
-        self.size = len(of.names) + (delay is None)
+        self.size = len(of.names) + (self.delay is None)
         # L and F are linear in all parameters together, but for gains of servos and for springs with their rests.
         self.varied = of.varied()
         self.linear = not any(name.startswith(("servo", "rest", "stiffness")) for name in of.names)
         self.best, self.least, self.done = self.begin, np.inf, 0
-        self.jacobian = np.zeros((1, self.size))
+        self.rest, self.jacobian = np.zeros(1), np.zeros((1, self.size))
 
     @cached_property
     def begin(self) -> Floats:
@@ -89,6 +92,15 @@ class Fit:
         y[: len(self.of.names)] = self.of.values
         y[self.prior] = 0.0
         return y
+
+    @cached_property
+    def bounds(self) -> tuple[Floats, Floats]:
+        """The least and the greatest y (size,); coordinates of bodies and most greatest values have none."""
+        free = self.size - (self.delay is None)
+        lower, upper = np.full(self.size, -LATEST), np.full(self.size, LATEST)
+        lower[:free], upper[:free] = self.of.least, np.inf
+        lower[self.prior] = -np.inf
+        return lower, upper
 
     def with_prior(self, r: Floats, J: Floats, y: Floats) -> tuple[Floats, Floats]:
         """Residuals and their derivatives in y, with those of the prior of bodies."""
@@ -119,11 +131,7 @@ class Fit:
         self, evaluate: Callable[[Floats], tuple[Floats, Floats]], y: Floats, evaluations: int, *, last: bool
     ) -> tuple[Floats, str]:
         """The y of least squares from ``y``, and how it ended."""
-        P = len(self.of.names)
-        lower, upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
-        lower[:P] = self.of.least
-        lower[self.prior] = -np.inf
-        lower[P:], upper[P:] = -LATEST, LATEST
+        lower, upper = self.bounds
 
         def at(y: Floats) -> tuple[Floats, Floats, float]:
             try:
@@ -136,7 +144,7 @@ class Fit:
             both = self.with_prior(r, J, y)
             cost = float(both[0] @ both[0])
             if cost < self.least:
-                self.best, self.least, self.jacobian = y, cost, J
+                self.best, self.least, self.rest, self.jacobian = y, cost, r, J
             if self.callback is not None:
                 self.callback(self.done, float(np.sqrt(r @ r / len(r))))
             return *both, cost
@@ -173,35 +181,17 @@ def _bodies(of: Parameters) -> list[tuple[list[int], Body]]:
     return found
 
 
+@dataclass(eq=False)
 class Run:
-    """A log on the grid of the steps."""
+    """A log on the grid of equal steps, and the starts of its stretches that were found last, by their first nodes."""
 
-    def __init__(self, fit: Fit, log: Log) -> None:
-        self.fit, self.log, h = fit, log, fit.dt
-        self.starts: dict[int, Floats] = {}
-        self.known: tuple[float, tuple[Floats, Floats]] = (np.nan, (np.zeros(0), np.zeros(0)))
-        after = (log.t - log.t[0]) / h
-        self.duration = float(log.t[-1] - log.t[0])
-        self.steps = max(1, int(np.ceil(after[-1] - 1e-6)))
-        # A sample next to a node is at it, though clocks round.
-        near = np.abs(after - np.rint(after)) < max(1e-6, 4.0 * np.spacing(np.abs(log.t[-1])) / h)
-        after = np.where(near, np.rint(after), after)
-        self.node = np.minimum(after.astype(int), self.steps - 1)
-        self.share = after - self.node
-        # The integral of the held controls up to each sample.
-        held = np.diff(log.t)[:, None] * log.u[:-1]
-        self.integral = np.concatenate([np.zeros((1, log.u.shape[1])), np.cumsum(held, axis=0)])
+    fit: Fit
+    log: Log
+    starts: dict[int, Floats] = field(default_factory=dict)
 
-    def controls(self, delay: float) -> tuple[Floats, Floats]:
-        """The mean controls of the steps (N, m), and their derivatives in the delay."""
-        if self.known[0] == delay:
-            return self.known[1]
-        edges = self.log.t[0] + self.fit.dt * np.arange(self.steps + 1) - delay
-        at = np.clip(np.searchsorted(self.log.t, edges + 1e-9, side="right") - 1, 0, len(self.log.t) - 1)
-        u = self.log.u[at]
-        passed = self.integral[at] + (edges - self.log.t[at])[:, None] * u
-        self.known = delay, (np.diff(passed, axis=0) / self.fit.dt, -np.diff(u, axis=0) / self.fit.dt)
-        return self.known[1]
+    def __post_init__(self) -> None:
+        self.grid = Grid.even(self.log, self.fit.dt)
+        self.duration = float(self.log.t[-1] - self.log.t[0])
 
     def settled(self, scene: Scene, late: float) -> list[Stretch]:
         """The stretches after a search for their starts, by shorter ones as :func:`identify` where none is known."""
@@ -215,29 +205,29 @@ class Run:
         """The log in stretches of about the horizon, or this much shorter."""
         parts = finer * max(1, round(self.duration / self.fit.horizon))
         # What acts in a gap is not in the log.
-        gaps = np.flatnonzero(np.diff(self.log.t) > GAP * np.median(np.diff(self.log.t)))
-        cuts = np.concatenate([self.node[gaps] + 1, self.node[gaps + 1]])
-        ends = np.unique(np.concatenate([self.steps * np.arange(parts + 1) // parts, cuts]))
+        node, steps, intervals = self.grid.node, self.grid.steps, np.diff(self.log.t)
+        gaps = np.flatnonzero(intervals > GAP * np.median(intervals))
+        cuts = np.concatenate([node[gaps] + 1, node[gaps + 1]])
+        ends = np.unique(np.concatenate([steps * np.arange(parts + 1) // parts, cuts]))
         found = [Stretch(self, a, b) for a, b in pairwise(ends.tolist())]
         return [each for each in found if each.samples.any()]
 
 
 class Stretch:
-    """Steps ``begin`` to ``end`` of a run, with the samples on them, and the start that was found last."""
+    """Steps ``begin`` to ``end`` of a run, and the samples on them."""
 
     def __init__(self, run: Run, begin: int, end: int) -> None:
         self.run, self.begin, self.end = run, begin, end
-        last = end == run.steps
-        self.samples = (run.node >= begin) & ((run.node < end) | last)
+        node, last = run.grid.node, end == run.grid.steps
+        self.samples = (node >= begin) & ((node < end) | last)
         if begin not in run.starts:
             run.starts[begin] = self._guess()
 
     def _guess(self) -> Floats:
         """Positions and velocities at the first node by parabolas through the samples next to it."""
-        log, fit = self.run.log, self.run.fit
-        at = log.t[0] + self.begin * fit.dt
-        first = int(np.searchsorted(log.t, at - 1e-9))
-        found = np.zeros((2, fit.of.scene.robot.dof))
+        log, at = self.run.log, self.run.grid.t[self.begin]
+        first = self.run.grid.at.searchsorted(self.begin)
+        found = np.zeros((2, log.q.shape[1]))
         for joint in range(found.shape[1]):
             there = np.flatnonzero(np.isfinite(log.q[:, joint]))
             near = there[np.argsort(np.abs(there - first), kind="stable")[:_GUESSED]]
@@ -252,22 +242,13 @@ class Stretch:
             motion, failure = rollout(scene, self.run.fit.integrator, x0[:n], x0[n:], open_loop(u), self.run.fit.dt)
         except SingularMassMatrix:
             return None
-        return None if failure is not None else motion
+        return None if failure is not None or not np.isfinite([motion.q, motion.v]).all() else motion
 
     def at_samples(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
         """Positions and velocities (k, n, ...) at the samples from those at the nodes (N + 1, n, ...), by cubics."""
-        run, h = self.run, self.run.fit.dt
-        k = run.node[self.samples] - self.begin
-        s = run.share[self.samples].reshape(-1, *[1] * (q.ndim - 1))
-        moved, a, b = q[k + 1] - q[k], h * v[k], h * v[k + 1]
-        bend, twist = 3.0 * moved - 2.0 * a - b, a + b - 2.0 * moved
-        # The nodes themselves where samples are at them.
-        at = np.where(s == 1.0, q[k + 1], q[k] + s * (a + s * (bend + s * twist)))
-        return at, np.where(s == 1.0, v[k + 1], (a + s * (2.0 * bend + 3.0 * s * twist)) / h)
-
-    def _weighed(self, q: Floats, v: Floats) -> Floats:
-        """Rows (r, ...) of the samples that are there, in units of their deviations."""
-        return self._rows(*self.at_samples(q, v))
+        grid, h = self.run.grid, self.run.fit.dt
+        curve, at = CubicHermiteSpline(np.arange(len(q)), q, h * v), grid.at[self.samples] - self.begin
+        return curve(at), curve(at, 1) / h
 
     @cached_property
     def measured(self) -> Floats:
@@ -276,6 +257,7 @@ class Stretch:
         return self._rows(log.q[self.samples], log.q[self.samples] if log.v is None else log.v[self.samples])
 
     def _rows(self, q: Floats, v: Floats) -> Floats:
+        """Rows (r, ...) of those at the samples (k, n, ...) that are there, in units of the samples' deviations."""
         fit, log, shape = self.run.fit, self.run.log, (1, -1, *[1] * (q.ndim - 2))
         rows = [(q / fit.deviation.reshape(shape))[np.isfinite(log.q[self.samples])]]
         if fit.v_deviation is not None and log.v is not None:
@@ -287,26 +269,26 @@ class Stretch:
         self, scene: Scene, varied: Sequence[Varied], delay: float, x0: Floats
     ) -> tuple[Floats, Floats, Floats] | None:
         """Predictions minus samples (r,), and derivatives in start (r, 2n) and in parameters and delay (r, P + 1)."""
-        u, by_delay = (part[self.begin : self.end] for part in self.run.controls(delay))
+        u, by_delay = self.run.grid.controls(delay, self.begin, self.end)
         motion = self.motion(scene, u, x0)
         if motion is None:
             return None
-        integrator, n = self.run.fit.integrator, scene.robot.dof
+        integrator, m = self.run.fit.integrator, len(x0)
         try:
             linear = linearize_steps(scene, motion, integrator, motion.q[0])
-            D = integrator.in_parameters(scene, motion, varied) if varied else np.zeros((motion.steps, 2 * n, 0))
+            by = motion_map(scene, motion, varied, linear, integrator)
         except LinearizationError:
             return None
-        by = motion_map(scene, motion, varied, (linear.A, linear.B, D), variational=integrator.variational)
-        none, late = np.zeros((len(D), 2 * n, 2 * n)), linear.B @ by_delay[:, :, None]
-        begin = np.concatenate([by.by_q0, by.by_v0, by.by_theta, np.zeros((2 * n, 1))], axis=1)
-        x = by.forward(begin, np.concatenate([none, D, late], axis=2))
-        in_v = by.in_velocities(x)[:, n:]
-        if by.variational:
-            in_v[:, :, 2 * n : -1] += by.shift
-        J, r = self._weighed(x[:, :n], in_v), self._weighed(motion.q, motion.v) - self.measured
+        late = by.B @ by_delay[:, :, None]
+        begin, none = np.eye(m, m + len(varied) + 1), np.zeros((len(late), m, m))
+        x = by.forward(begin, np.concatenate([none, by.D, late], axis=2))
         # Those of motions that fly apart overflow, and so do their squares.
-        return (r, J[:, : 2 * n], J[:, 2 * n :]) if np.isfinite(np.vdot(J, J) + r @ r) else None
+        if not np.isfinite(x).all():
+            return None
+        state = np.concatenate([motion.q, motion.v], axis=1)[:, :, None]
+        rows = self._rows(*self.at_samples(*np.split(np.concatenate([state, x], axis=2), 2, axis=1)))
+        r, J = rows[:, 0] - self.measured, rows[:, 1:]
+        return (r, J[:, :m], J[:, m:]) if np.isfinite(np.vdot(J, J) + r @ r) else None
 
     def fitted(self, scene: Scene, varied: Sequence[Varied], late: float) -> tuple[Floats, Floats]:
         """Residuals (r,) at the best start, and derivatives in parameters and delay (r, P + 1) as the start follows."""
@@ -349,9 +331,9 @@ def simulations(fit: Fit, stretches: Sequence[Stretch], y: Floats) -> tuple[Floa
     return r, J
 
 
-def predictions(fit: Fit, runs: Sequence[Run], y: Floats) -> tuple[Floats, Floats]:
+def predictions(fit: Fit, grids: Sequence[Grid], y: Floats) -> tuple[Floats, Floats]:
     """Innovations of all logs in units of their deviations, and derivatives in y; gains are taken as constant."""
-    return _evaluated(fit, y, [partial(_innovations, fit, run) for run in runs])
+    return _evaluated(fit, y, [partial(_innovations, fit, grid) for grid in grids])
 
 
 _Part = Callable[[Scene, Sequence[Varied], float], tuple[Floats, Floats]]
@@ -369,24 +351,25 @@ def _evaluated(fit: Fit, y: Floats, parts: Sequence[_Part]) -> tuple[Floats, Flo
     return r, found
 
 
-def _innovations(fit: Fit, run: Run, scene: Scene, varied: Sequence[Varied], late: float) -> tuple[Floats, Floats]:
-    """As :func:`predictions` for one log, in values and delay: one step from node to node of its grid."""
-    log = run.log
-    if not np.array_equal(run.node + run.share, np.arange(len(log.t))):
-        raise InputError("under noise the samples of a log must be evenly spaced by dt: leave dt out, or resample it")
-    u, by_delay = run.controls(late)
-    log = replace(log, u=np.concatenate([u, u[-1:]]))
+def _innovations(fit: Fit, grid: Grid, scene: Scene, varied: Sequence[Varied], late: float) -> tuple[Floats, Floats]:
+    """As :func:`predictions` for one log, in values and delay, by a filter with a row for each step."""
+    u, by_delay = grid.controls(late)
     try:
-        seen = filtered(scene, log, fit.q_noise, fit.v_noise, dt=2.0 * fit.dt, integrator=fit.integrator)
+        seen = filtered(scene, grid.at_nodes(u), fit.q_noise, fit.v_noise, method=fit.integrator)
     except LinearizationError:
-        known = sum(part.measured.size for part in run.stretches())
+        known = np.isfinite(grid.log.q).sum()
+        if fit.v_noise is not None and grid.log.v is not None:
+            known += np.isfinite(grid.log.v).sum()
         return np.full(known, LOST), np.zeros((known, len(varied) + 1))
-    n, q, v = scene.robot.dof, seen.q, seen.v
-    motion = _through(scene, fit, seen.forward.state, q, v, u)
-    D = fit.integrator.in_parameters(scene, motion, varied)
-    B = linearize_steps(scene, motion, fit.integrator, q[0]).B
-    more = np.concatenate([D, B @ by_delay[:, :, None]], axis=2)
-    x = np.zeros((2 * n, more.shape[2]))
+    h, n = seen.given.h, scene.robot.dof
+    alike = np.rint(np.log(h / h.min()) / _ALIKE)
+    more = np.zeros((len(h), 2 * n, len(varied) + 1))
+    for a, b in pairwise([0, *(np.flatnonzero(np.diff(alike)) + 1).tolist(), len(h)]):
+        motion = _steps(scene, fit.integrator, float(h[a:b].mean()), seen, u, a, b)
+        more[a:b, :, :-1] = fit.integrator.in_parameters(scene, motion, varied)
+        by_force = fit.integrator.linearize(scene, motion)[1]
+        more[a:b, :, -1:] = by_force @ scene.transmission @ by_delay[a:b, :, None]
+    x = np.zeros(more.shape[1:])
     rows: list[Floats] = []
     for k, (H, gain) in enumerate(zip(seen.forward.rows, seen.gains, strict=True)):
         if k:
@@ -398,18 +381,12 @@ def _innovations(fit: Fit, run: Run, scene: Scene, varied: Sequence[Varied], lat
     return both[:, 0], both[:, 1:]
 
 
-def _through(scene: Scene, fit: Fit, state: Floats, q: Floats, v: Floats, u: Floats) -> Trajectory:
-    """Steps of the filter, from each state to about the next, as a motion."""
-    first = rollout(scene, fit.integrator, q[0], v[0], open_loop(u[:1]), fit.dt)[0]
-    N, statistics = len(u), first.statistics
-    p = np.ascontiguousarray(state[:, scene.robot.dof : 2 * scene.robot.dof])
-    whole = {
-        name: np.zeros((N, *getattr(statistics, name).shape[1:]), getattr(statistics, name).dtype)
-        for name in ("newton_iterations", "jets", "sweeps", "residual", "branch_margin", "energy_defect")
-    }
-    return first.changed(
-        t=fit.dt * np.arange(N + 1.0),
-        q=q, v=v, p=p, u=u, dw=np.zeros((N, scene.processes)),
-        u_stages=np.zeros((N, 0, u.shape[1])), u_nodes=np.zeros((N + 1, 0)),
-        statistics=replace(statistics, substeps=np.ones(N, np.int64), halvings=statistics.halvings[:0], **whole),
-    )  # fmt: skip
+def _steps(scene: Scene, method: Integrator, dt: float, seen: Estimate, u: Floats, a: int, b: int) -> Trajectory:
+    """Steps ``a`` to ``b`` of a filter, from each state to about the next, as a motion."""
+    n = scene.robot.dof
+    q, p, v = (x[a : b + 1] for x in (seen.q, seen.forward.state[:, n : 2 * n], seen.v))
+    none, zero = np.zeros(b - a), np.zeros(b - a, np.int64)
+    statistics = StepStatistics(zero, zero, zero, zero + 1, np.zeros(0, np.uint8), none, none, none)
+    first = Segment(q[:1], p[:1], v[:1], u[:0], np.zeros(1), statistics)
+    steps = Segment(q[1:], p[1:], v[1:], u[a:b], none, statistics)
+    return trajectory_of(scene, method, dt, first, [steps], None, None)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -15,11 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.linalg import qr
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
-from varpin.estimation.filter import MISFIT, misfit
+from varpin.estimation.filter import misfit
 from varpin.estimation.fit import LATEST, LOST, Fit, Run, Stretch, predictions, simulations
+from varpin.estimation.grid import Grid
 from varpin.estimation.log import Log, as_log
 from varpin.estimation.parameters import parameters_of
 from varpin.finding import Finding, announce
@@ -38,8 +40,10 @@ _HORIZON = 1.0
 _NOTHING = 1e-7
 # Coefficients of a combination below this share of its largest are rounding.
 _NAMED = 1e-3
-# Standard deviations of a delay, and of what fits better beyond a bound, that are told.
-_SURE = 4.0
+# Standard deviations of a delay, and residuals in units of the encoders' noise, that are told.
+_SURE, _MISFIT = 4.0, 2.0
+# Deviations by which the logs ask for less than a least value that are told: zeros with noise are nearly always nearer.
+_PULLED = 3.0
 # Doubts about a log from which no value could be right.
 _NEVER = ("dead encoder", "clock of the log")
 
@@ -155,7 +159,7 @@ def identify(
     Other Args:
         delay: By how much the controls act later than the logs say [s]; found, too, if left out.
         dt: Time step [s]; if left out, the logs' usual one. What is identified has its error, so a coarse step needs an
-            integrator of high order.
+            integrator of high order. Under noise it is as for :func:`kalman_filter`.
         horizon: Length [s] of the stretches that are simulated, each from a start of its own; 1 s if left out, np.inf
             for whole logs. Longer ones tell more of what is slow, and depart further from a log of which the scene
             does not model everything.
@@ -189,7 +193,8 @@ def identify(
     y, status, evaluation = fit.begin, "converged", count("evaluations", evaluations)
     try:
         if scene.processes:
-            y, status = fit.search(partial(predictions, fit, runs), y, evaluation, last=True)
+            grids = [Grid.between(log, dt) for log in matched]
+            y, status = fit.search(partial(predictions, fit, grids), y, evaluation, last=True)
         else:
             for finer in range(fit.doublings(runs), -1, -1):
                 stretches = [part for run in runs for part in run.stretches(2**finer)]
@@ -214,39 +219,49 @@ def _made(fit: Fit, y: Floats, runs: Sequence[Run], apart: Sequence[Run], status
     covariance, null = _covariance(fit, slopes)
     # Where the residuals are larger than the encoders' noise, the values are less certain by as much.
     covariance = covariance * max(1.0, fit.least / len(fit.jacobian))
-    all_runs = [*runs, *apart]
-    predicted, before = ([np.full(run.log.q.shape, np.nan) for run in all_runs] for _ in range(2))
-    changes = beyond = np.zeros(P)
+    # Ctrl-C leaves out the motions and the check of the step that are not done, and keeps the values.
+    every = [*runs, *apart]
+    predicted, before = ([np.full(run.log.q.shape, np.nan) for run in every] for _ in range(2))
+    changes = np.zeros(P)
     try:
-        for k, run in enumerate(all_runs):
+        for k, run in enumerate(every):
             stretches = run.settled(scene, late)
             predicted[k] = _positions(run, stretches, scene, late)
             before[k] = _positions(run, stretches, fit.of.scene, 0.0 if fit.delay is None else fit.delay)
-        if not fit.of.scene.processes:
-            changes, beyond = _step_error(fit, runs, y)
+        if status != "interrupted" and not fit.of.scene.processes:
+            changes = _step_error(fit, runs, y)
     except KeyboardInterrupt:
-        # The values are known; what is left are their motions.
         status = "interrupted"
-    residuals = tuple(run.log.q - own for run, own in zip(all_runs, predicted, strict=True))
-    deviation = float(np.sqrt(covariance[P, P])) if fit.delay is None else 0.0
+    residuals = [run.log.q - own for run, own in zip(every, predicted, strict=True)]
     known, of = len(runs), fit.of
-    motions: dict[str, Any] = {"predicted": predicted[:known], "predicted_before": before[:known]}
-    motions |= {"residuals": residuals[:known], "held_out": residuals[known:], "logs": [run.log for run in runs]}
     made = Identification(
-        names=of.names, values=values, start=of.values, units=of.units, covariance=covariance[:P, :P], delay=late,
-        delay_deviation=deviation, null_space=null, scene=scene, status=status,
-        **{name: tuple(each) for name, each in motions.items()},
-    )  # fmt: skip
-    found = tuple(_doubts(fit, made, changes, beyond))
-    announce(logger, fit.of.scene.announced, fit.dt, found)
+        names=of.names,
+        values=values,
+        start=of.values,
+        units=of.units,
+        covariance=covariance[:P, :P],
+        delay=late,
+        delay_deviation=float(np.sqrt(covariance[P, P])) if fit.delay is None else 0.0,
+        null_space=null,
+        scene=scene,
+        logs=tuple(run.log for run in runs),
+        predicted=tuple(predicted[:known]),
+        predicted_before=tuple(before[:known]),
+        residuals=tuple(residuals[:known]),
+        held_out=tuple(residuals[known:]),
+        status=status,
+    )
+    found = tuple(_doubts(fit, made, changes))
+    announce(logger, of.scene.announced, fit.dt, found)
     return made.changed(warnings=(*found, *(each for run in runs for each in run.log.warnings)))
 
 
 def _positions(run: Run, stretches: Sequence[Stretch], scene: Scene, late: float) -> Floats:
     """Positions at the samples (K, n) of motions from the starts of stretches; NaN where they cannot be simulated."""
-    found, u = np.full(run.log.q.shape, np.nan), run.controls(late)[0]
+    found = np.full(run.log.q.shape, np.nan)
     for each in stretches:
-        motion = each.motion(scene, u[each.begin : each.end], run.starts[each.begin])
+        u, _ = run.grid.controls(late, each.begin, each.end)
+        motion = each.motion(scene, u, run.starts[each.begin])
         if motion is not None:
             found[each.samples] = each.at_samples(motion.q, motion.v)[0]
     return found
@@ -276,31 +291,25 @@ def _covariance(fit: Fit, slopes: Floats) -> tuple[Floats, tuple[str, ...]]:
 
 def _sentences(null: Floats, names: Sequence[str]) -> list[str]:
     """Combinations (k, P) that nothing depends on, in words: each has a parameter that no other has."""
-    found = []
-    rows = null / np.abs(null).max(axis=1, keepdims=True, initial=1e-300)
-    for k in range(len(rows)):
-        column = int(np.argmax(np.abs(rows[k])))
-        if not abs(rows[k, column]) > _NAMED:
-            continue
-        rows[k] /= rows[k, column]
-        for other in range(len(rows)):
-            if other != k:
-                rows[other] -= rows[other, column] * rows[k]
-    for row in rows:
-        own = int(np.argmax(np.isclose(row, 1.0)))
-        rest = [c for c in np.argsort(-np.abs(row)) if c != own and abs(row[c]) > _NAMED]
+    found: list[str] = []
+    rows = null / np.abs(null).max(axis=1, keepdims=True, initial=0.0)
+    if not len(rows):
+        return found
+    own = qr(rows, mode="r", pivoting=True)[1][: len(rows)]
+    for k, row in zip(own, np.linalg.solve(rows[:, own], rows), strict=True):
+        rest = [c for c in np.argsort(-np.abs(row)) if c not in own and abs(row[c]) > _NAMED]
         if not rest:
-            found.append(f"{names[own]}: the logs do not depend on it")
+            found.append(f"{names[k]}: the logs do not depend on it")
         elif len(rest) == 1:
-            found.append(f"{names[own]} and {names[rest[0]]}: only {names[rest[0]]} {-row[rest[0]]:+.4g} {names[own]}")
+            found.append(f"{names[k]} and {names[rest[0]]}: only {names[rest[0]]} {-row[rest[0]]:+.4g} {names[k]}")
         else:
             trade = ", ".join(f"{row[c]:+.4g} {names[c]}" for c in rest)
-            found.append(f"{names[own]}: a change of 1 is undone by {trade}")
+            found.append(f"{names[k]}: a change of 1 is undone by {trade}")
     return found
 
 
-def _step_error(fit: Fit, runs: Sequence[Run], y: Floats) -> tuple[Floats, Floats]:
-    """What half the step, and no bounds, would change in the values (P,), to first order."""
+def _step_error(fit: Fit, runs: Sequence[Run], y: Floats) -> Floats:
+    """What half the step changes in the values (P,), to first order."""
     finer = copy(fit)
     finer.dt *= 0.5
     steps = []
@@ -309,29 +318,17 @@ def _step_error(fit: Fit, runs: Sequence[Run], y: Floats) -> tuple[Floats, Float
         r, J = simulations(each, [part for run in of for part in run.settled(scene, fit.late(y))], y)
         both, slopes = fit.with_prior(r, J, y)
         steps.append(np.linalg.lstsq(slopes, both, rcond=_NOTHING)[0])
-    slopes = fit.values(y)[1]
-    return slopes @ (steps[0] - steps[1]), -slopes @ steps[0]
+    change: Floats = fit.values(y)[1] @ (steps[0] - steps[1])
+    return change
 
 
-def _doubts(fit: Fit, made: Identification, changes: Floats, beyond: Floats) -> list[Finding]:
-    found = []
+def _doubts(fit: Fit, made: Identification, changes: Floats) -> Iterator[Finding]:
+    """What is doubtful about the values, the worst first; ``changes`` (P,) are those by half the step."""
     if fit.least >= LOST**2:
         text = "motions with these values cannot be simulated: a column or its unit is wrong, or dt is too long"
-        found.append(Finding("lost", text))
-    squares = [np.square(own / fit.deviation) for own in made.residuals]
-    together = np.concatenate(squares)
-    there = np.isfinite(together)
-    by_joint = np.sqrt(np.where(there, together, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1))
-    worst = int(np.argmax(by_joint))
-    if fit.of.scene.processes:
-        found += misfit(float(np.sqrt(fit.least / len(fit.jacobian))))
-    elif not by_joint[worst] <= MISFIT:
-        joint = fit.of.scene.robot.joint_names[worst]
-        text = (
-            f"the residuals of {joint!r} are {by_joint[worst]:.3g} times q_noise: something acts that is no "
-            "parameter (friction, a payload elsewhere), or its column, clock or q_noise is wrong"
-        )
-        found.append(Finding("misfit", text, joint, value=float(by_joint[worst])))
+        yield Finding("lost", text)
+    misfits = list(_misfit(fit, made))
+    yield from misfits
     by_noise = np.divide(np.abs(changes), made.deviations, out=np.zeros_like(changes), where=made.deviations > 0.0)
     k = int(np.argmax(by_noise))
     if not by_noise[k] <= 1.0:
@@ -340,21 +337,45 @@ def _doubts(fit: Fit, made: Identification, changes: Floats, beyond: Floats) -> 
             f"half the step changes {made.names[k]} by {changes[k]:.3g} {made.units[k]}, {by_noise[k]:.3g} standard "
             f"deviations: take a smaller dt{higher}"
         )
-        found.append(Finding("step", text, value=float(changes[k]), unit=made.units[k]))
-    beyond = np.where(made.values <= fit.of.least, -beyond, 0.0)
-    k = int(np.argmax(beyond - _SURE * made.deviations))
-    if beyond[k] > _SURE * made.deviations[k]:
-        text = f"{made.names[k]} is at its least value, and {beyond[k]:.3g} {made.units[k]} less would fit better"
-        found.append(Finding("bound", f"{text}: something acts that is no parameter", value=float(beyond[k])))
+        yield Finding("step", text, value=float(changes[k]), unit=made.units[k])
     if made.status == "evaluations":
-        found.append(Finding("evaluations", "the search ended at its most evaluations: evaluations= allows more"))
+        yield Finding("evaluations", "the search ended at its most evaluations: evaluations= allows more")
+    if ended := _ended(fit):
+        text = f"{', '.join(ended)} ended at the least value, and the logs ask for less: something else acts"
+        yield Finding("bound", text)
     if fit.delay is None and abs(made.delay) > max(_SURE * made.delay_deviation, 1e-2 * fit.dt):
         text = f"the controls act {1e3 * made.delay:.3g} ms later than the logs say, which the values allow for"
-        if any(each.kind == "misfit" for each in found):
+        if misfits:
             text = f"a delay of {1e3 * made.delay:.3g} ms fits best, or stands for what the scene lacks"
         if abs(made.delay) >= LATEST:
             text = (
                 f"the delay of the controls is {LATEST:g} s or more, beyond what is looked for: give delay= or shift t"
             )
-        found.append(Finding("delay", text, value=made.delay, unit="s"))
-    return found
+        yield Finding("delay", text, value=made.delay, unit="s")
+
+
+def _misfit(fit: Fit, made: Identification) -> Iterator[Finding]:
+    """Residuals, or innovations under noise, that are larger than their noise."""
+    if fit.of.scene.processes:
+        yield from misfit(fit.least, len(fit.jacobian))
+        return
+    squares = np.square(np.concatenate(made.residuals) / fit.deviation)
+    there = np.isfinite(squares)
+    by_joint = np.sqrt(np.where(there, squares, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1))
+    worst = int(np.argmax(by_joint))
+    if not by_joint[worst] <= _MISFIT:
+        joint = fit.of.scene.robot.joint_names[worst]
+        text = (
+            f"the residuals of {joint!r} are {by_joint[worst]:.3g} times q_noise: something acts that is no "
+            "parameter (friction, a payload elsewhere), or its column, clock or q_noise is wrong"
+        )
+        yield Finding("misfit", text, joint, value=float(by_joint[worst]))
+
+
+def _ended(fit: Fit) -> list[str]:
+    """Parameters at their least values which the logs hold there, by more than noise would."""
+    sizes = np.maximum(np.linalg.norm(fit.jacobian, axis=0), np.finfo(float).tiny)
+    # By how many of its deviations each would be less if it were alone.
+    less = fit.rest @ fit.jacobian / sizes / max(1.0, np.sqrt(fit.least / len(fit.jacobian)))
+    held = (fit.best <= fit.bounds[0]) & (less > _PULLED)
+    return [name for name, told in zip(fit.of.names, held, strict=False) if told]

@@ -15,7 +15,7 @@ from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.estimation.parameters import parameters_of
 from varpin.integrators.base import Integrator, Varied
-from varpin.linearization import linearize, matching_integrator, node_jets, velocity_at_nodes
+from varpin.linearization import Linearization, linearize, matching_integrator, node_jets, velocity_at_nodes
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.support.checks import finite_array
 from varpin.trajectory import Trajectory
@@ -64,9 +64,7 @@ class Sensitivities:
     @property
     def start(self) -> Floats:
         """Derivatives of (q, v) at the nodes in (q0, v0) (N + 1, 2n, 2n)."""
-        of = self._map
-        begin = np.concatenate([of.by_q0, of.by_v0], axis=1)
-        return of.in_velocities(of.forward(begin, None))
+        return self._map.forward(np.eye(2 * self.q.shape[1]), None)
 
     def gradient(
         self, loss_q: ArrayLike | None = None, *, loss_v: ArrayLike | None = None, loss_p: ArrayLike | None = None
@@ -91,17 +89,13 @@ class Sensitivities:
 
 @dataclass(frozen=True, eq=False)
 class MotionMap:
-    """The linear map from parameters, start and controls to nodes: x' = A x + B u + D theta."""
+    """The linear map from parameters, start and controls to nodes: x' = A x + B u + D theta of x = (q, v)."""
 
     A: Floats  # (N, 2n, 2n)
     B: Floats  # (N, 2n, m)
     D: Floats  # (N, 2n, P)
-    by_q0: Floats  # (2n, n) of x at the start
-    by_v0: Floats  # (2n, n)
-    by_theta: Floats  # (2n, P)
-    other: Floats  # (N + 1, n, 2n) of v in (q, p), or of p in (q, v)
-    shift: Floats  # (N + 1, n, P) of v at fixed (q, p), or of p at fixed (q, v)
-    variational: bool
+    to_p: Floats  # (N + 1, n, 2n) of p in (q, v)
+    pull: Floats  # (N + 1, n, P) of p at fixed (q, v)
 
     def forward(self, x: Floats, D: Floats | None) -> Floats:
         """States (N + 1, 2n, k) from the first (2n, k)."""
@@ -111,20 +105,15 @@ class MotionMap:
             states[j + 1] = A @ states[j] if D is None else A @ states[j] + D[j]
         return states
 
-    def in_velocities(self, x: Floats) -> Floats:
-        """(q, v) of states (N + 1, 2n, k) at fixed parameters."""
-        n = self.other.shape[1]
-        return np.concatenate([x[:, :n], self.other @ x], axis=1) if self.variational else x
-
     def backward(self, in_q: Floats, in_v: Floats, in_p: Floats) -> Gradient:
-        own, else_ = (in_p, in_v) if self.variational else (in_v, in_p)
-        loss = np.concatenate([in_q, own], axis=1) + np.einsum("ka,kab->kb", else_, self.other)
-        theta = np.einsum("ka,kap->p", else_, self.shift)
+        n = in_q.shape[1]
+        loss = np.concatenate([in_q, in_v], axis=1) + np.einsum("ka,kab->kb", in_p, self.to_p)
+        theta = np.einsum("ka,kap->p", in_p, self.pull)
         row, u = loss[-1], np.empty((len(self.B), self.B.shape[2]))
         for j in range(len(self.A) - 1, -1, -1):
             u[j], theta = row @ self.B[j], theta + row @ self.D[j]
             row = loss[j] + row @ self.A[j]
-        return Gradient(theta + row @ self.by_theta, row @ self.by_q0, row @ self.by_v0, u)
+        return Gradient(theta, row[:n], row[n:], u)
 
 
 def sensitivities(
@@ -156,41 +145,28 @@ def sensitivities(
     of = parameters_of(scene, parameters)
     linear = linearize(scene, motion, integrator=integrator)
     chosen = matching_integrator(scene, motion, integrator)
-    varied = of.varied()
-    D = chosen.in_parameters(scene, motion, varied)
-    by = motion_map(scene, motion, varied, (linear.A, linear.B, D), variational=chosen.variational)
-    x, n = by.forward(by.by_theta, D), scene.robot.dof
-    other = by.other @ x + by.shift
-    v, p = (other, x[:, n:]) if chosen.variational else (x[:, n:], other)
-    return Sensitivities(of.names, of.values, x[:, :n], v, p, by)
+    by = motion_map(scene, motion, of.varied(), linear, chosen)
+    x, n = by.forward(np.zeros(by.D.shape[1:]), by.D), scene.robot.dof
+    return Sensitivities(of.names, of.values, x[:, :n], x[:, n:], by.to_p @ x + by.pull, by)
 
 
 def motion_map(
-    scene: Scene,
-    motion: Trajectory,
-    varied: Sequence[Varied],
-    steps: tuple[Floats, Floats, Floats],
-    *,
-    variational: bool,
+    scene: Scene, motion: Trajectory, varied: Sequence[Varied], linear: Linearization, integrator: Integrator
 ) -> MotionMap:
-    """The map of a motion whose steps have the derivatives A, B and D."""
-    q, v = (np.ascontiguousarray(x) for x in (motion.q, motion.v))
+    """The map of a motion with its linearization."""
+    q, v, n = motion.q, motion.v, scene.robot.dof
     M, Lvq = node_jets(scene, q, v)
-    pull = np.zeros((*q.shape, len(varied)))
+    to_p, pull = np.concatenate([Lvq, M], axis=2), np.zeros((*q.shape, len(varied)))
     for k, each in enumerate(varied):
-        pull[:, :, k] = momentum_change(each, q, v)
-    n, none = scene.robot.dof, np.zeros((scene.robot.dof, len(varied)))
-    one, zero = np.eye(n), np.zeros((n, n))
-    if variational:
-        other = velocity_at_nodes(scene, q, v)
-        begin = (np.vstack([one, Lvq[0]]), np.vstack([zero, M[0]]), np.vstack([none, pull[0]]))
-        return MotionMap(*steps, *begin, other, -other[:, :, n:] @ pull, variational=True)
-    begin = (np.vstack([one, zero]), np.vstack([zero, one]), np.vstack([none, none]))
-    return MotionMap(*steps, *begin, np.concatenate([Lvq, M], axis=2), pull, variational=False)
-
-
-def momentum_change(varied: Varied, q: Floats, v: Floats) -> Floats:
-    """The derivative of p = M v in a parameter at nodes (N, n)."""
-    above, below = (node_jets(scene, q, v)[0] for scene in (varied.above, varied.below))
-    change: Floats = np.einsum("kij,kj->ki", above - below, v) / varied.distance
-    return change
+        above, below = (node_jets(near, q, v)[0] for near in (each.above, each.below))
+        pull[:, :, k] = np.einsum("kij,kj->ki", above - below, v) / each.distance
+    A, B, D = linear.A, linear.B, np.zeros((len(linear.A), 2 * n, 0))
+    if varied:
+        D = integrator.in_parameters(scene, motion, varied)
+    if integrator.variational:
+        to_v = velocity_at_nodes(scene, q, v)[1:]
+        D = D + A[:, :, n:] @ pull[:-1]
+        A = np.concatenate([A[:, :, :n], np.zeros_like(A[:, :, n:])], axis=2) + A[:, :, n:] @ to_p[:-1]
+        A, B, D = (np.concatenate([x[:, :n], to_v @ x], axis=1) for x in (A, B, D))
+        D[:, n:] -= to_v[:, :, n:] @ pull[1:]
+    return MotionMap(A, B, D, to_p, pull)
