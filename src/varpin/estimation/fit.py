@@ -242,7 +242,7 @@ class Stretch:
             motion, failure = rollout(scene, self.run.fit.integrator, x0[:n], x0[n:], open_loop(u), self.run.fit.dt)
         except SingularMassMatrix:
             return None
-        return None if failure is not None else motion
+        return None if failure is not None or not np.isfinite([motion.q, motion.v]).all() else motion
 
     def at_samples(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
         """Positions and velocities (k, n, ...) at the samples from those at the nodes (N + 1, n, ...), by cubics."""
@@ -357,9 +357,9 @@ def _innovations(fit: Fit, grid: Grid, scene: Scene, varied: Sequence[Varied], l
     try:
         seen = filtered(scene, grid.at_nodes(u), fit.q_noise, fit.v_noise, method=fit.integrator)
     except LinearizationError:
-        known = sum(
-            np.isfinite(x).sum() for x in (grid.log.q, None if fit.v_noise is None else grid.log.v) if x is not None
-        )
+        known = np.isfinite(grid.log.q).sum()
+        if fit.v_noise is not None and grid.log.v is not None:
+            known += np.isfinite(grid.log.v).sum()
         return np.full(known, LOST), np.zeros((known, len(varied) + 1))
     h, n = seen.given.h, scene.robot.dof
     alike = np.rint(np.log(h / h.min()) / _ALIKE)
@@ -383,7 +383,8 @@ def _innovations(fit: Fit, grid: Grid, scene: Scene, varied: Sequence[Varied], l
 
 def _steps(scene: Scene, method: Integrator, dt: float, seen: Estimate, u: Floats, a: int, b: int) -> Trajectory:
     """Steps ``a`` to ``b`` of a filter, from each state to about the next, as a motion."""
-    q, p, v = (x[a : b + 1] for x in (seen.q, seen.forward.state[:, scene.robot.dof :][:, : scene.robot.dof], seen.v))
+    n = scene.robot.dof
+    q, p, v = (x[a : b + 1] for x in (seen.q, seen.forward.state[:, n : 2 * n], seen.v))
     none, zero = np.zeros(b - a), np.zeros(b - a, np.int64)
     statistics = StepStatistics(zero, zero, zero, zero + 1, np.zeros(0, np.uint8), none, none, none)
     first = Segment(q[:1], p[:1], v[:1], u[:0], np.zeros(1), statistics)

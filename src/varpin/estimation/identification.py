@@ -159,7 +159,7 @@ def identify(
     Other Args:
         delay: By how much the controls act later than the logs say [s]; found, too, if left out.
         dt: Time step [s]; if left out, the logs' usual one. What is identified has its error, so a coarse step needs an
-            integrator of high order.
+            integrator of high order. Under noise it is as for :func:`kalman_filter`.
         horizon: Length [s] of the stretches that are simulated, each from a start of its own; 1 s if left out, np.inf
             for whole logs. Longer ones tell more of what is slow, and depart further from a log of which the scene
             does not model everything.
