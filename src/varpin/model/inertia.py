@@ -45,15 +45,12 @@ def fault(link: str, mass: float, moments: Floats) -> tuple[str, str]:
         return "", ""
     low, middle, high = moments
     shown = ", ".join(f"{moment:.3g}" for moment in moments)
+    kind, sentence = "non-physical inertia", f"link {link!r} has a non-physical inertia: "
     if low < -TRIANGLE_TOLERANCE * abs(high):
-        return "non-physical inertia", (
-            f"link {link!r} has a non-physical inertia: it is not positive definite (principal moments {shown} kg m^2)"
-        )
+        return kind, f"{sentence}it is not positive definite (principal moments {shown} kg m^2)"
     if high > (1.0 + TRIANGLE_TOLERANCE) * (low + middle):
-        return "non-physical inertia", (
-            f"link {link!r} has a non-physical inertia: its principal moments {shown} kg m^2 violate the "
-            f"triangle inequality, {high:.3g} > {low:.3g} + {middle:.3g}"
-        )
+        unequal = f"the triangle inequality, {high:.3g} > {low:.3g} + {middle:.3g}"
+        return kind, f"{sentence}its principal moments {shown} kg m^2 violate {unequal}"
     return "", ""
 
 
