@@ -382,7 +382,7 @@ def test_matrices_beyond_the_range_of_indices_are_refused_before_there_is_room_f
         diffusion=Diffusion(none, np.zeros((n, 0, 0)), none, none),
     )
     still = np.zeros((1, n))
-    step = (vp.Midpoint().scheme.tableau, 0.5, vp.Midpoint().guards(vp.Guard()))
+    step = (vp.Midpoint().scheme.tableau, 0.5, vp.Midpoint()._guards(vp.Guard()))
     assert core.Rollout(chain, *step, 1.0, 1).begin(still, still)
     with refused(ValueError, "matrix"):
         core.Rollout(chain, vp.Gauss(2).scheme.tableau, *step[1:], 1.0, 1)

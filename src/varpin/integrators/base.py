@@ -415,17 +415,15 @@ def diffusion_and_drift(
 ) -> tuple[Floats, Floats]:
     """Diffusion fields F (n, K) at one state, and the Ito correction: the drift (n,) from Stratonovich to Ito.
 
-    Of controls that are linear over a step between ``ends`` (1, m) the drift is the mean.
+    The drift is (1/2) sum_i (dF_i/dv) M^-1 F_i [N m or N], equation (N1) and (1.3) of the paper; it is zero if no field
+    depends on the velocity. Of controls that are linear over a step between ``ends`` (1, m) it is the mean drift.
     """
     found = over_steps(scene.noise, q[None], v[None], u[None], ends, start)
     return found.F[0], _drift(scene, q[None], v[None], found)[0]
 
 
 def _drift(scene: Scene, q: Floats, v: Floats, fields: Fields) -> Floats:
-    """The drift (N, n) from Stratonovich to Ito, (1/2) sum_i (dF_i/dv) M^-1 F_i [N m or N], at (q, v) (N, n).
-
-    Equation (N1), and (1.3) of the paper; it is zero if no field depends on the velocity.
-    """
+    """The drift (N, n) of :func:`diffusion_and_drift` at (q, v) (N, n)."""
     if fields.Fv is None:
         return np.zeros_like(q)
     M, _ = scene.core.jets(np.ascontiguousarray(q), np.ascontiguousarray(v))

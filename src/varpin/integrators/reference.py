@@ -77,14 +77,14 @@ class Reference(Integrator):
             raise InputError(f"{self} integrates no noise: leave it out of the scene")
         return Run(_Paths(self, scene, np.hstack([q0, v0]), ForwardDynamics(scene.core)), q0.copy())
 
-    def force_of(self, values: Floats, dt: float) -> Force:
+    def _force(self, values: Floats, dt: float) -> Force:
         """The force (n,) as a function of time [s] in a step, from values at its stages (s, n) or a constant (1, n)."""
         if len(values) == 1:
             return lambda _: values[0]
         times = np.array(self.stage_times)
         return lambda t: interpolation(times, np.array([t / dt]))[0] @ values
 
-    def atol_at(self, x: Floats, slope: Floats, dt: float) -> Floats:
+    def _atol(self, x: Floats, slope: Floats, dt: float) -> Floats:
         """Absolute tolerances on (q, v) (2n,) around a state."""
         n = len(x) // 2
         speed = max(np.abs(x[n:]).max() + dt * np.abs(slope[n:]).max(), _SLOWEST)
@@ -113,7 +113,7 @@ class Reference(Integrator):
         for k in range(trajectory.steps):
             x = np.append(trajectory.q[k], trajectory.v[k])
             try:
-                J[k] = self._derivatives(scene, x, self.force_of(force[k], dt), dt, ramp=ramp)
+                J[k] = self._derivatives(scene, x, self._force(force[k], dt), dt, ramp=ramp)
             except (_RunsAway, LinearizationError):
                 raise LinearizationError(k, k * dt, TOO_STEEP) from None
         return J
@@ -134,7 +134,7 @@ class Reference(Integrator):
 
         y = np.concatenate([x, np.eye(2 * n, 3 * n).ravel()])
         slope = rate(dt if ramp else 0.0, y)
-        atol = self.atol_at(x, slope[: 2 * n], dt)
+        atol = self._atol(x, slope[: 2 * n], dt)
         # Scales by units: dv/dq is a rate, dq/dv a time, derivatives in the force are inverse inertias.
         blocks = np.empty((2 * n, 3 * n))
         unit = atol[0]
@@ -192,7 +192,7 @@ class _Paths:
                 first = u[s - held - 1] if s > held else commands.before[i]
                 share = (held + commands.stage_times[:, None]) / commands.hold
                 values = (1.0 - share) * first + share * u[s]
-            force = self.method.force_of(values @ self.scene.actuation.T + (drift[i, s] if len(drift) else 0.0), dt)
+            force = self.method._force(values @ self.scene.actuation.T + (drift[i, s] if len(drift) else 0.0), dt)
             try:
                 x, nodes.tally[i, s, 2] = self._step(i, force, dt)
             except _RunsAway:
@@ -214,7 +214,7 @@ class _Paths:
                 raise _RunsAway
             return slope
 
-        atol = self.method.atol_at(self.x[i], rate(0.0, self.x[i]), dt)
+        atol = self.method._atol(self.x[i], rate(0.0, self.x[i]), dt)
         x, evaluations, self.tried = _integrate(rate, self.x[i], dt, self.method.rtol, atol, self.tried)
         return x, evaluations + 1
 

@@ -155,7 +155,7 @@ class Variational(Integrator):
             raise InputError("noise whose fields depend on the velocity does not go with constraints")
         return places
 
-    def guards(self, guard: Guard | None, *, energy: bool = True) -> Guards:
+    def _guards(self, guard: Guard | None, *, energy: bool = True) -> Guards:
         """A guard for the core; None accepts every root.
 
         Without ``energy`` the balance is not checked: kinematic inputs exchange energy.
@@ -171,7 +171,7 @@ class Variational(Integrator):
         )
 
     def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
-        guards = self.guards(self.guard, energy=not scene.inputs)
+        guards = self._guards(self.guard, energy=not scene.inputs)
         places = self._places(scene) if scene.constraints else None
         method = scene.core, self.scheme.tableau, float(self.tolerance), guards, self.left
         rollout = Rollout(*method, len(q0), self.holds_noise, places)
@@ -185,7 +185,7 @@ class Variational(Integrator):
         return True
 
     def fork(self, state: Run) -> Run:
-        return replace(state, paths=state.paths.fork(self.guards(self.guard, energy=not state.driven)))
+        return replace(state, paths=state.paths.fork(self._guards(self.guard, energy=not state.driven)))
 
     def _segments(self, scene: Scene, paths: Any, nodes: RolloutArrays) -> list[Segment]:
         found = super()._segments(scene, paths, nodes)
@@ -313,7 +313,7 @@ class Variational(Integrator):
 
     def filtered(self, scene: Scene, log: FilterLog) -> FilterArrays:
         """See :meth:`Integrator.filtered`; the state is (q, p)."""
-        guards = self.guards(self.guard or Guard(), energy=False)
+        guards = self._guards(self.guard or Guard(), energy=False)
         found = filter_variational(scene.core, self.scheme.tableau, float(self.tolerance), guards, log)
         return self._reached(found, log, REASONS)
 
@@ -336,7 +336,7 @@ class Variational(Integrator):
             "tolerance": float(self.tolerance),
             # Without noise the steps are the same, and there is nothing to check. Otherwise they differ by the noise
             # impulses, and their roots must lie on the branch that is connected to dt -> 0.
-            "guards": self.guards(self.guard if trajectory.noisy else None, energy=False),
+            "guards": self._guards(self.guard if trajectory.noisy else None, energy=False),
             "dt": float(trajectory.dt),
             **{name: np.ascontiguousarray(array) for name, array in arrays.items()},
         }
