@@ -189,6 +189,16 @@ def test_passes_that_do_not_fit_are_refused():
         core.BackwardPass(1, gradient, hessian).run(H, 1, 0.0, **given, **empty(given, 1))
 
 
+def test_rows_are_made_triangular():
+    rows = np.random.default_rng(2).normal(size=(7, 4)) * [[1e6], [1.0], [1e-6], [1.0], [1e6], [1.0], [0.0]]
+    found = core.triangular(rows, 4)
+    assert_allclose(found.T @ found, rows.T @ rows, rtol=1e-12)
+    assert (np.tril(found, -1) == 0.0).all()
+    for leading in (-1, 5):
+        with refused(ValueError, "triangular"):
+            core.triangular(rows, leading)
+
+
 def exact(array):
     return np.vectorize(Decimal, otypes=[object])(np.asarray(array, dtype=float))
 
