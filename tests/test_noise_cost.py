@@ -121,7 +121,7 @@ def test_feedback_as_fast_as_the_steps_is_told_of_where_noise_matters(strength, 
     start = {"q0": reference(0.0), "v0": [np.pi, 0.2 * np.pi, 0.0]}
     found = vp.solve(vp.OptimalControlProblem(scene, cost, **start, dt=4e-3, steps=50))
     in_halves = found.problem.at(dt=2e-3, hold=2, integrator=found.problem.integrator)
-    finer = in_halves.simulate(found.policy_on("momentum", 2))
+    finer = in_halves.simulate(found.policy)
     halves = noise_cost(Steps(in_halves, finer), of(found)[1])
     assert abs(halves - found.noise_cost) > 0.1 * halves
     assert abs(halves - found.noise_cost) < 0.05 * (found.cost + halves)
