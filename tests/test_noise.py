@@ -525,6 +525,11 @@ def test_paths_that_are_all_one_and_seeds_of_nothing_are_told_of():
         told = vp.simulate_ensemble(scene, q0, [0, 0], **SHORT, paths=paths, rng=0).warnings
         same = scene is QUIET and paths > 1 and q0 is not starts
         assert len(told) == len(about(told, "nothing random")) == same
+    # Whatever the seed is: noise is drawn from a fresh one, too.
+    for scene in (QUIET, noisy()):
+        told = vp.simulate_ensemble(scene, [0, 0], [0, 0], **SHORT, paths=3, rng=None).warnings
+        assert [warning for warning in told if "noise" in warning] == about(told, "nothing random")
+        assert bool(told) == (scene is QUIET)
 
 
 def problem(scene):

@@ -105,6 +105,8 @@ def test_no_name_becomes_markup(objects):
         assert all(one in Reader(shown[name]).text for one in NAMES)
     assert NAMES[0] in Reader(shown["precision"]).text
     assert "Take <Gauss>." in Reader(shown["advice"]).text
+    assert row(shown["verification"], "planned")[0] == f"{objects['verification'].planned_cost:.6e}"
+    assert row(shown["verification"], "", "cost") == ["loss", "end off by [rad or m]"]
 
 
 def test_a_repr_is_a_line_without_arrays(objects):

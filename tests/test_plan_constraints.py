@@ -360,6 +360,13 @@ def moving(speed):
     return in_speeds(constraints=[vp.KeepInSphere(ROBOT, "tip", way, 5.0), clear])
 
 
+def test_constraints_print_their_numbers():
+    robot = vp.planar_chain(2)
+    tip = robot.model.frames[-1].name
+    ball = vp.KeepOutOfSphere(robot, tip, [1.0, 2.0, 3.0], 0.25, margin=2.0)
+    assert not unnamed(repr(ball), "KeepOutOfSphere(", repr(tip), "[1.0, 2.0, 3.0]", "0.25", "margin=2.0")
+
+
 @pytest.mark.parametrize(
     ("build", "one", "other", "fact"),
     [

@@ -270,6 +270,7 @@ def test_refuses_marks_it_cannot_show(ur5, sweep, run, crank, tmp_path):
     no("reference[1, 0]", "nan", reference=[[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]])
     no("targets", targets=[0.0, 0.0, 1.0])
     no("targets['a']", "(3,)", "(4, 4)", targets={"a": np.zeros(4)})
+    no("targets['a']", "(3,)", "shape ()", targets={"a": 3.0})
     no("targets['a'][2]", "inf", targets={"a": [0.0, 0.0, np.inf]})
     no("targets['a']", "pose", targets={"a": np.diag([1.0, 1.0, -1.0, 1.0])})
     no("targets['a']", "2", motion=sweep[:1], targets={"a": np.zeros((2, 3))})

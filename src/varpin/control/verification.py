@@ -19,7 +19,7 @@ from varpin.signals.commands import open_line, open_loop
 from varpin.simulation.choice import STIFF
 from varpin.simulation.record import rollout
 from varpin.simulation.spectrum import rate_at_rest
-from varpin.support.markup import Printed
+from varpin.support.markup import facts, table
 from varpin.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class Played(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Verification(Printed):
+class Verification:
     """Comparison of a plan with an accurate integration of the continuous system.
 
     Costs are integrals over the continuous motion, without noise; NaN where that motion diverges.
@@ -114,26 +114,37 @@ class Verification(Printed):
             f"plan's are not known to a percent{changed}: give max_substeps of {2 * self.substeps} or more"
         )
 
-    def __str__(self) -> str:
-        lines = [
-            f"{'':16}{'cost':>14}{'loss':>12}  end off by [rad or m]",
-            f"{'planned':16}{self.planned_cost:14.6e}",
-        ]
+    def _rows(self) -> list[tuple[str, str, str, str]]:
+        """The costs, losses and gaps of the plan and of both motions, below their names."""
+        rows = [("", "cost", "loss", "end off by [rad or m]"), ("planned", f"{self.planned_cost:.6e}", "", "")]
         opened = ("controls alone", self.open_loop_cost, self.open_loop_loss, self.open_loop_gap)
         closed = ("with feedback", self.closed_loop_cost, self.closed_loop_loss, self.closed_loop_gap)
         for name, cost, loss, gap in (opened, closed):
-            numbers = f"{cost:14.6e}{percent(loss):>12}  {gap:.2e}" if np.isfinite(cost) else f"{'runs away':>14}"
-            lines.append(f"{name:16}{numbers}")
+            known = np.isfinite(cost)
+            rows.append((name, f"{cost:.6e}", percent(loss), f"{gap:.2e}") if known else (name, "runs away", "", ""))
+        return rows
+
+    def _notes(self) -> list[str]:
+        """What is below the table."""
         good = "all motions run away" if self._diverges else "how good the costs are is not known"
         if np.isfinite(self.accuracy):
             good = f"costs are good to {self.accuracy:.0e} of themselves"
-        lines += [f"{good} ({self.substeps} substeps a step, {self.integrator})", self.reading]
+        notes = [f"{good} ({self.substeps} substeps a step, {self.integrator})", self.reading]
         for alone, fed in zip(self.open_loop_constraints, self.constraints, strict=True):
             ways = ("controls alone", alone.violation), ("with feedback", fed.violation)
             worst = ", ".join(f"{name} {x:.1e}" if np.isfinite(x) else f"{name} runs away" for name, x in ways)
             where = f" ({fed.where})" if fed.violation > 0.0 else ""
-            lines.append(f"{fed.label} is violated by [{fed.unit}]: {worst}{where}")
-        return "\n".join(lines)
+            notes.append(f"{fed.label} is violated by [{fed.unit}]: {worst}{where}")
+        return notes
+
+    def _repr_html_(self) -> str:
+        head, *rows = self._rows()
+        notes = [("", note) for note in self._notes()]
+        return facts("Verification on the continuous system", notes, table(head, rows))
+
+    def __str__(self) -> str:
+        lines = (f"{name:16}{cost:>14}{loss:>12}  {gap}".rstrip() for name, cost, loss, gap in self._rows())
+        return "\n".join([*lines, *self._notes()])
 
 
 def excess(cost: float, base: float) -> float:

@@ -22,7 +22,6 @@ from varpin.mechanics.wiener import children
 from varpin.signals.controls import commands_of
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.choice import given_integrator, stronger, usual_integrator
-from varpin.simulation.simulate import noise_forgotten
 from varpin.simulation.start import in_other_units, on_constraints, time_steps
 from varpin.support.checks import (
     JointValues,
@@ -129,8 +128,7 @@ def simulate_ensemble(
     found = sums.run(executor, workers, progress)
     if len(sums.failures) == paths:
         raise VarpinError(sums.failing())
-    alike = noise_forgotten(scene, rng) if paths > 1 and all((x == x[0]).all() for x in start) else ()
-    found = (*in_other_units(scene, start[0][0], start[1][0]), *moved, *alike, *found)
+    found = (*in_other_units(scene, start[0][0], start[1][0]), *moved, *_alike(scene, start), *found)
     announce(logger, scene.announced, dt, found)
     return sums.result(found)
 
@@ -145,6 +143,17 @@ def _onto_constraints(scene: Scene, start: Sequence[Floats]) -> tuple[list[Float
     findings = ([finding.about(f"path {path}: " * (not alike)) for finding in own] for path, own in enumerate(found))
     moved = [np.broadcast_to(np.array(x), start[0].shape) for x in (q, v)]
     return moved, tuple(next((own for own in findings if own), []))
+
+
+def _alike(scene: Scene, start: Sequence[Floats]) -> tuple[Finding, ...]:
+    """A finding if all paths are the same motion."""
+    if scene.processes or len(start[0]) < 2 or any((x != x[0]).any() for x in start):
+        return ()
+    sentence = (
+        "the scene has no noise and all paths begin alike, so that they are one and the same motion: "
+        "varpin.Scene(robot, noise=...) tells them apart"
+    )
+    return (Finding("nothing random", sentence),)
 
 
 def _require_memory(scene: Scene, steps: int, paths: int, *, store: bool) -> None:

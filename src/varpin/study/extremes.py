@@ -250,7 +250,7 @@ def check_robot(
 
     Raises:
         RobotError: There is no such robot, or its file cannot be read.
-        InputError: ``patience`` is not positive, or ``integrators`` are none.
+        InputError: ``patience`` is not positive, or ``integrators`` are not varpin's.
         StudyInterrupted: Ctrl-C; holds the motions so far. It is a KeyboardInterrupt.
     """
     arm = robot if isinstance(robot, Robot) else load_robot(robot)

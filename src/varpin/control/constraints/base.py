@@ -136,7 +136,14 @@ class PlanConstraint(Frozen, ABC):
         return type(self).__name__
 
     def __repr__(self) -> str:
-        return self.label
+        """All parameters."""
+        values = {name: value for name, value in vars(self).items() if not isinstance(value, Robot) and name[0] != "_"}
+        arguments = (f"{name}={_argument(value)}" for name, value in values.items() if name != "kinematics")
+        return f"{type(self).__name__}({', '.join(arguments)})"
+
+
+def _argument(value: object) -> str:
+    return repr(value.tolist() if isinstance(value, np.ndarray) else value)
 
 
 class OfStates(PlanConstraint):

@@ -199,7 +199,7 @@ def _target(name: str, value: Any, end: float) -> tuple[Floats, Floats, Floats |
     """Times up to an ``end`` [s], positions (K, 3) [m] and, for poses, quaternions (K, 4)."""
     array = require_finite(name, as_floats(name, value))
     array = array[None] if array.shape in ((3,), (4, 4)) else array
-    if not len(array) or array.shape[1:] not in ((3,), (4, 4)):
+    if array.shape[1:] not in ((3,), (4, 4)) or not len(array):
         raise InputError(
             f"{name} must be a point (3,), a pose (4, 4) or pin.SE3, or rows of them, (K, 3) or (K, 4, 4); got shape "
             f"{array.shape}"
