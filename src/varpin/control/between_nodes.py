@@ -160,9 +160,12 @@ def _times(problem: OptimalControlProblem, steps: Integers) -> Floats:
     return found
 
 
-def watched(problem: OptimalControlProblem) -> list[bool]:
-    """Which constraints may have rows between nodes: inequalities of states."""
-    return [isinstance(item, BoundStates) and not item.source.equality for item in problem.bound_constraints]
+def watched(problem: OptimalControlProblem) -> dict[int, BoundStates]:
+    """The constraints that are to hold between nodes, by their index: inequalities of states."""
+    if not (problem.linear or problem.between_nodes):
+        return {}
+    bounds = enumerate(problem.bound_constraints)
+    return {i: item for i, item in bounds if isinstance(item, BoundStates) and not item.source.equality}
 
 
 def middles(problem: OptimalControlProblem) -> Instants:
@@ -170,11 +173,8 @@ def middles(problem: OptimalControlProblem) -> Instants:
 
     Linear controls can alternate, so that a motion keeps to constraints at its nodes and nowhere else.
     """
-    of = [i for i, may in enumerate(watched(problem)) if may and (problem.linear or problem.between_nodes)]
-    if not of:
-        return NOWHERE
-    rows = np.array([(i, step) for i in of for step in range(problem.steps)])
-    return Instants(rows, np.full(len(rows), 0.5), cubic=True)
+    rows = [(i, step) for i in watched(problem) for step in range(problem.steps)]
+    return Instants(np.array(rows), np.full(len(rows), 0.5), cubic=True) if rows else NOWHERE
 
 
 def followed(problem: OptimalControlProblem, instants: Instants, motion: Trajectory, backoff: list[Floats]) -> Instants:
@@ -182,8 +182,6 @@ def followed(problem: OptimalControlProblem, instants: Instants, motion: Traject
 
     ``backoff`` are the margins (K, rows) of all constraints at the nodes.
     """
-    if not any(watched(problem)) or not (problem.linear or problem.between_nodes):
-        return instants
     found, violated = list[tuple[int, int, float]](), False
     for i, near in _seen(problem, motion).items():
         scale, (places, values, there) = problem.bound_constraints[i].scale, _peaks(near)
@@ -232,18 +230,18 @@ def _seen(problem: OptimalControlProblem, motion: Trajectory) -> dict[int, Float
 
     Minus infinity in the first step where the start violates the constraint. Empty where a step fails in parts.
     """
-    steps = np.arange(motion.steps)
+    steps, bounds = np.arange(motion.steps), watched(problem)
     u = _controls(problem, problem.control_rows(motion), steps)
-    parts = _in_parts(problem, np.concatenate([motion.q[:-1], motion.v[:-1], u], axis=1))
+    given = np.concatenate([motion.q[:-1], motion.v[:-1], u], axis=1)
+    parts = _in_parts(problem, given) if bounds else None
     if parts is None:
         return {}
     q, v = (x.reshape(-1, x.shape[2]) for x in parts)
     times, found = _times(problem, steps), {}
-    for i, (item, looks) in enumerate(zip(problem.bound_constraints, watched(problem), strict=True)):
-        if looks and isinstance(item, BoundStates):
-            found[i] = item.of.at(times).values(q, v).reshape(len(steps), PARTS + 1, -1)
-            if (found[i][0, 0] > FEASIBLE).any():
-                found[i][0] = -np.inf
+    for i, item in bounds.items():
+        found[i] = item.of.at(times).values(q, v).reshape(len(steps), PARTS + 1, -1)
+        if (found[i][0, 0] > FEASIBLE).any():
+            found[i][0] = -np.inf
     return found
 
 

@@ -430,34 +430,41 @@ class OptimalControlProblem(Frozen):
         feedback rounding errors alone make an upright arm fall over.
         """
         scene, q, u = self.scene, self.q0, self.holding_controls()
-        R = self.steps if self.linear else self.decisions
+        N = self.decisions - self.linear
         driven = tangent_basis(scene, q).T @ scene.actuation
         omega = 2.0 * natural_rate(scene, q, u) + 1.0 / self.duration
         gains = np.zeros((scene.controls, 2 * q.size))
         # None where controls are held too long.
         if np.linalg.matrix_rank(driven) == len(driven) and omega * self.period <= FASTEST:
             gains = self.feedback(omega)
-        reference = np.append(q, np.zeros(q.size))
-        on: Literal["momentum", "velocity"] = "momentum" if self.integrator.variational else "velocity"
-        rows = np.tile(u, (R, 1)), np.tile(gains, (R, 1, 1)), np.tile(reference, (R, 1))
-        return self.policy_of(*rows, on, before=u if self.linear else None)
+        at_rest = np.append(q, np.zeros(q.size))
+        return self.policy_of(np.tile(u, (self.decisions, 1)), np.tile(gains, (N, 1, 1)), np.tile(at_rest, (N, 1)))
 
     def policy_of(
         self,
         u: Floats,
         gains: Floats,
         reference: Floats,
-        on: Literal["momentum", "velocity"] | None,
+        on: Literal["momentum", "velocity"] | None = None,
+        *,
+        before: JointValues | None = None,
         **options: Any,
     ) -> LinearPolicy:
-        """A policy of the problem's decisions; ``options`` as for the policy."""
+        """A policy of the problem's decisions; ``options`` as for the policy.
+
+        It is on the integrator's state by default. Linear controls u are those of the ends of lines where that
+        ``before`` them is given.
+        """
+        on = on or ("momentum" if self.integrator.variational else "velocity")
+        if self.linear and before is None:
+            before, u = u[0], u[1:]
         scene, limits = self.scene, (self.control_limits[0], self.control_limits[1])
         options |= {"limits": limits, "period": self.period, "linear": self.linear, "hold": self.hold}
         options |= {"joints": scene.control_joints, "servos": scene.servo_joints}
         if scene.processes and self.integrator.variational == (on == "momentum"):
             # Feedback and margins are for the noise as this method takes it.
             options["integrator"] = self.integrator
-        return LinearPolicy(u, gains, reference, on=on, **options)
+        return LinearPolicy(u, gains, reference, on=on, before=before, **options)
 
     def feedback(self, omega: float) -> Floats:
         """Gains (m, 2n) on x of the forces -M(q0) (omega^2 dq + 2 omega dv), as far as controls give them."""

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,7 +28,7 @@ from varpin.finding import announce
 from varpin.linearization import node_jets
 from varpin.mechanics.forces import of_kind
 from varpin.model import degrees_hint
-from varpin.signals.commands import as_moved, open_line, open_loop, with_ends
+from varpin.signals.commands import as_moved, with_ends
 from varpin.signals.policy import LinearPolicy
 from varpin.simulation.choice import STIFF
 from varpin.simulation.spectrum import masses
@@ -318,19 +318,18 @@ def _policy_along(problem: OptimalControlProblem, path: _Path, controls: object)
         u = _rows_of(problem, controls)
     u = np.clip(u, *problem.control_limits)
     q, v = q[:-1:hold], v[:-1:hold]
-    on: Literal["momentum", "velocity"] = "momentum" if problem.integrator.variational else "velocity"
-    if on == "momentum":
+    if problem.integrator.variational:
         v = (node_jets(scene, q, v)[0] @ v[:, :, None])[:, :, 0]
     gains = np.tile(problem.feedback(FASTEST / problem.period), (len(q), 1, 1))
     if not problem.linear:
-        return problem.policy_of(u, gains, np.hstack([q, v]), on)
+        return problem.policy_of(u, gains, np.hstack([q, v]))
     if controls is None:
         # Lines through the means of neighbours.
         held, u = u, np.vstack([u[:1], 0.5 * (u[:-1] + u[1:]), u[-1:]])
         u[1:] = with_ends(scene, u[1:], held)
     u = problem.begun(u)
     # A line answers a state half a step later than a held control, so that feedback may do harm.
-    tries = [problem.policy_of(u[1:], own, np.hstack([q, v]), on, before=u[0]) for own in (gains, 0.0 * gains)]
+    tries = [problem.policy_of(u, own, np.hstack([q, v])) for own in (gains, 0.0 * gains)]
     return min(tries, key=lambda policy: _cost_under(problem, policy))
 
 
@@ -348,25 +347,20 @@ def first_commands(problem: OptimalControlProblem, controls: JointValues | Linea
     Raises:
         InputError: Controls of a wrong shape, or of another hold or kind than the problem's.
     """
-    m, variational, limits = problem.scene.controls, problem.integrator.variational, problem.control_limits
+    m, n, variational = problem.scene.controls, problem.scene.robot.dof, problem.integrator.variational
+    limits, N = problem.control_limits, problem.decisions - problem.linear
     if isinstance(controls, Solution):
         controls = controls.policy_on("momentum" if variational else "velocity")
     if controls is None:
         controls = problem.holding_policy()
     if not isinstance(controls, LinearPolicy):
-        u = _rows_of(problem, controls)
-        if problem.linear:
-            line = open_line(problem.begun(np.clip(u, *limits)), problem.integrator.stage_times)
-            return line._replace(limits=limits)
-        return open_loop(u)._replace(hold=problem.hold, limits=limits)
+        controls = problem.policy_of(_rows_of(problem, controls), np.zeros((N, m, 2 * n)), np.zeros((N, 2 * n)))
     if (hold := controls.hold_at(problem.dt)) != problem.hold:
         raise InputError(f"the policy holds its controls over {hold} steps, the problem {problem.hold}")
     if controls.linear != problem.linear:
         policy, wanted = ("linear", "held") if controls.linear else ("held", "linear")
         raise InputError(f"the policy's controls are {policy}, the problem's {wanted}")
-    commands = controls.commands(
-        problem.steps, m, problem.scene.robot.dof, variational, problem.dt, problem.integrator.stage_times
-    )
+    commands = controls.commands(problem.steps, m, n, variational, problem.dt, problem.integrator.stage_times)
     commands = commands._replace(limits=np.clip(commands.limits, *limits))
     if problem.linear:
         return commands._replace(before=problem.begun(np.clip(commands.before, *limits)))
