@@ -15,7 +15,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.constraints import BoundConstraint, BoundRate, Horizon, PlanConstraint
+from varpin.control.constraints import BoundConstraint, BoundRate, Horizon, PlanConstraint, WithinControlRate
 from varpin.control.costs import (
     BoundSum,
     ControlRate,
@@ -320,7 +320,9 @@ class OptimalControlProblem(Frozen):
             control = control_values("before", before, self.scene.control_joints, self.scene.controls)
             given["cost"] = with_control_before(given.get("cost", self.cost), control)
             kept = tuple_of("constraints", given.get("constraints", self.constraints), PlanConstraint)
-            given["constraints"] = tuple(item.after(control) for item in kept)
+            given["constraints"] = tuple(
+                item.changed(before=control) if isinstance(item, WithinControlRate) else item for item in kept
+            )
         same = {name: getattr(self, name) for name in _KEPT}
         if self.integrator_by_default and not moves:
             same["integrator"] = None

@@ -126,10 +126,6 @@ class PlanConstraint(Frozen, ABC):
             InputError: The constraint is for another robot, or does not fit the controls.
         """
 
-    def after(self, before: Floats) -> PlanConstraint:  # noqa: ARG002
-        """The constraint on a horizon with another control before it (m,)."""
-        return self
-
     @property
     def label(self) -> str:
         """Name in reports."""

@@ -141,9 +141,6 @@ class WithinControlRate(PlanConstraint):
             raise InputError(f"{name} must be > 0 [control/s], got {limit!r}")
         self.before = before
 
-    def after(self, before: Floats) -> PlanConstraint:
-        return WithinControlRate(self.limit, before)
-
     def bind(self, horizon: Horizon) -> BoundConstraint:
         name, m, joints = "WithinControlRate", horizon.controls, horizon.control_joints
         if isinstance(self.limit, Mapping):
