@@ -33,7 +33,7 @@ from varpin.control.sizes import FEASIBLE, HARMLESS, NOTABLE, ROUNDING, SLIGHT, 
 from varpin.control.solution import Solution
 from varpin.control.stages import Cost, Rows, Steps, change, states
 from varpin.core.arrays import Commands
-from varpin.errors import LinearizationError, StepError
+from varpin.errors import InputError, LinearizationError, StepError
 from varpin.integrators import Integrator
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.noise import NoiseFieldError
@@ -135,9 +135,16 @@ class Search:
             raise CostError(culprits, f"the cost of the first motion is {self.cost}")
 
     def resume(self, plan: Solution) -> None:
-        """Continue from the state of a plan."""
+        """Continue from the state of a plan.
+
+        Raises:
+            InputError: The plan is of another problem, or does not hold the state of its search.
+        """
         state, known, second_order = plan.search, plan.multipliers, self.second_order
-        assert state is not None
+        if state is None:
+            raise InputError("resume: the solution does not hold the state of its search; give it as controls")
+        if other := self.problem.mismatch(plan.problem.setting, plan.trajectory, plan.cost):
+            raise InputError(f"resume: the solution is {other}; give it as controls")
         self._move(plan.trajectory, self.problem.shares(plan.trajectory))
         for owner, names in ((self, _KEPT), (self.tightening, _OF_MARGINS)):
             for name in names:

@@ -157,28 +157,18 @@ def solve(
                 raise InputError(f"resume goes on with the solution's own search: leave out either {name} or resume")
         if not isinstance(resume, Solution):
             raise InputError(f"resume must be a Solution, got {type(resume).__name__}")
-        if resume.search is None:
-            raise InputError("resume: the solution does not hold the state of its search; give it as controls")
-        if other := problem.mismatch(resume.problem.setting, resume.trajectory, resume.cost):
-            raise InputError(f"resume: the solution is {other}; give it as controls")
     path = None if states is None else _path_of(problem, states)
     if check:
         # The search may take long where values are in wrong units.
         announce(logger, problem.scene.announced, problem.dt, foreseen(problem))
 
     def plan_of(
-        problem: OptimalControlProblem,
-        controls: JointValues | LinearPolicy | Solution | None,
-        resume: Solution | None = None,
-        path: _Path | None = None,
-        tolerance: float = tolerance,
+        problem: OptimalControlProblem, controls: JointValues | LinearPolicy | Solution | None, tolerance: float
     ) -> Solution:
         search = Search(problem, second_order=second_order, regularization=regularization)
         interrupted, last = False, most
         if resume is not None:
             search.resume(resume)
-        elif path is not None:
-            search.begin(first_commands(problem, _policy_along(problem, path, controls)))
         elif controls is not None:
             search.begin(first_commands(problem, controls))
         else:
@@ -197,20 +187,24 @@ def solve(
         plan = searched(search, tolerance, last, deadline, report)
         if interrupted:
             return replace(plan, status=Status.INTERRUPTED, reason="under dry friction that is wider than the scene's")
-        if plan.status is Status.INFEASIBLE and not (controls is None and path is None):
+        if plan.status is Status.INFEASIBLE and controls is not None:
             advice = "; the default start, without controls= and states=, may have a plan"
             return replace(plan, reason=plan.reason + advice)
         return plan
 
     with one_thread():
+        if path is not None:
+            controls = _policy_along(problem, path, controls)
         if true_cost is None:
-            solution = plan_of(problem, controls, resume, path)
+            solution = plan_of(problem, controls, tolerance)
         else:
             wish = positive("true_cost", true_cost, "1")
 
             def once(finer: OptimalControlProblem, start: Trajectory | None) -> Solution:
-                given, on = (controls, path) if start is None else (finer.decided(start), (start.q, start.v))
-                return plan_of(finer, given, None, on, max(tolerance, NOTABLE * wish))
+                given = controls
+                if start is not None:
+                    given = _policy_along(finer, (start.q, start.v), finer.decided(start))
+                return plan_of(finer, given, max(tolerance, NOTABLE * wish))
 
             solution = refine(problem, once, wish, lambda: deadline - time.perf_counter())
     return looked_at(solution) if check else solution
