@@ -14,7 +14,7 @@ import numpy as np
 
 from varpin.arrays import Floats, Integers
 from varpin.errors import InputError
-from varpin.model import Robot
+from varpin.model import Robot, require_robot
 from varpin.model.kinematics import require_same
 from varpin.support.checks import finite
 from varpin.support.frozen import Frozen
@@ -150,6 +150,13 @@ class OfStates(PlanConstraint):
     _unit = "m"
     _scale = LENGTH
 
+    def __init__(self, robot: Robot, margin: float = 0.0) -> None:
+        """Take what all have."""
+        name = type(self).__name__
+        self.robot, self.margin = require_robot(robot, name), finite(f"{name} margin", margin)
+        if self.margin < 0.0:
+            raise InputError(f"{name} margin must be >= 0 [standard deviations], got {self.margin:g}")
+
     def bind(self, horizon: Horizon) -> BoundConstraint:
         require_same(self.label, self.robot, horizon.robot)
         last = slice(-1 if self.equality else 0, None)
@@ -194,11 +201,3 @@ class BoundStates(BoundConstraint):
 
     def jacobian(self, q: Floats, v: Floats) -> Floats:
         return self.of.jacobian(q[self.places], v[self.places])
-
-
-def checked_margin(constraint: PlanConstraint, margin: object) -> float:
-    """A margin in standard deviations as a float >= 0."""
-    number = finite(f"{type(constraint).__name__} margin", margin)
-    if number < 0.0:
-        raise InputError(f"{type(constraint).__name__} margin must be >= 0 [standard deviations], got {number:g}")
-    return number

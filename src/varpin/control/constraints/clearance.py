@@ -9,9 +9,9 @@ from typing import Self
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
-from varpin.control.constraints.base import OfStates, checked_margin
+from varpin.control.constraints.base import OfStates
 from varpin.errors import InputError
-from varpin.model import Robot, require_robot
+from varpin.model import Robot
 from varpin.model.clearance import Obstacle, clearance
 from varpin.support.checks import finite, flag, path_like, tuple_of
 
@@ -60,10 +60,9 @@ class KeepClear(OfStates):
             InputError: There are no pairs, a link has no shapes, the SRDF file has no link of the robot, or
                 a value is invalid.
         """
-        self.robot = require_robot(robot, type(self).__name__)
+        super().__init__(robot, margin)
         self.obstacles = tuple_of("obstacles", obstacles, Obstacle)
         self.distance = finite("KeepClear distance", distance)
-        self.margin = checked_margin(self, margin)
         itself = flag("KeepClear itself", itself)
         names = None if links is None else tuple_of("names of links", links, str)
         file = None if srdf is None else path_like("KeepClear srdf", srdf)

@@ -11,9 +11,9 @@ import scipy
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
-from varpin.control.constraints.base import OfStates, checked_margin
+from varpin.control.constraints.base import OfStates
 from varpin.errors import InputError
-from varpin.model import Robot, require_robot
+from varpin.model import Robot
 from varpin.model.kinematics import frame_kinematics
 from varpin.support.checks import finite, finite_array, named_limits, over_time, positive, rotation_matrix
 
@@ -26,10 +26,9 @@ class _OfFrame(OfStates):
     frame: str
 
     def __init__(self, robot: Robot, frame: str, margin: float = 0.0) -> None:
-        self.robot = require_robot(robot, type(self).__name__)
+        super().__init__(robot, margin)
         self.kinematics = frame_kinematics(robot, frame)
         self.frame = frame
-        self.margin = checked_margin(self, margin)
 
     @property
     def label(self) -> str:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from varpin.arrays import Floats, Integers
-from varpin.control.constraints.base import LENGTH, BoundConstraint, Horizon, OfStates, PlanConstraint, checked_margin
+from varpin.control.constraints.base import LENGTH, BoundConstraint, Horizon, OfStates, PlanConstraint
 from varpin.errors import InputError
-from varpin.model import Robot, joint_unit, require_robot
+from varpin.model import Robot, joint_unit
 from varpin.support.checks import (
     JointValues,
     as_floats,
@@ -37,11 +37,10 @@ class _WithinLimits(OfStates):
                 robot's [rad or m; of velocities rad/s or m/s].
             margin: In standard deviations of the joint under noise; see the page on plans within constraints.
         """
-        self.robot = require_robot(robot, type(self).__name__)
+        super().__init__(robot, margin)
         name = type(self).__name__
         own = (-robot.velocity_limit, robot.velocity_limit) if self.in_velocity else robot.position_limits
         self.limits = some_limits(name, limits, own, robot.name, robot.joint_names)
-        self.margin = checked_margin(self, margin)
         # Upper limits, then lower ones.
         sides, columns = np.nonzero(np.isfinite(self.limits[::-1]))
         self._columns, self._signs = columns + self.in_velocity * robot.dof, np.where(sides == 0, 1.0, -1.0)
