@@ -201,3 +201,10 @@ class BoundStates(BoundConstraint):
 
     def jacobian(self, q: Floats, v: Floats) -> Floats:
         return self.of.jacobian(q[self.places], v[self.places])
+
+
+def finite_sides(limits: Floats) -> tuple[Integers, Floats, Floats, list[str]]:
+    """Columns, signs, bounds and names of the finite ones of limits (2, n), a row for each, upper ones first."""
+    sides, columns = np.nonzero(np.isfinite(limits[::-1]))
+    signs = np.where(sides == 0, 1.0, -1.0)
+    return columns, signs, signs * limits[::-1][sides, columns], [("upper", "lower")[side] for side in sides]

@@ -69,14 +69,10 @@ class KeepClear(OfStates):
         if file is not None and not itself:
             raise InputError("KeepClear srdf leaves out pairs of links, and there are none without itself=True")
         self._of = clearance(robot, self.obstacles, links=names, itself=itself, srdf=file, capsules=capsules)
-        self.pairs = self._of.names
+        self.pairs = self._rows = self._of.names
         self.capsules = {
             name: (begin.tolist(), end.tolist(), radius) for name, (begin, end, radius) in self._of.capsules.items()
         }
-
-    @property
-    def _rows(self) -> tuple[str, ...]:  # type: ignore[override]
-        return self.pairs
 
     def at(self, times: Floats) -> Self:
         return self.changed(_of=self._of.over(times))

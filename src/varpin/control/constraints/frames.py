@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
-from varpin.control.constraints.base import OfStates
+from varpin.control.constraints.base import OfStates, finite_sides
 from varpin.errors import InputError
 from varpin.model import Robot
 from varpin.model.kinematics import frame_kinematics
@@ -160,12 +160,9 @@ class KeepInBox(_WithinPlanes):
         self.limits = named_limits("KeepInBox", (lower, upper), None, 3)
         if not np.isfinite(self.limits).any():
             raise InputError("KeepInBox has no finite side")
-        # Upper sides, then lower ones.
-        sides, axes = np.nonzero(np.isfinite(self.limits[::-1]))
-        signs = np.where(sides == 0, 1.0, -1.0)
-        self._outward, self._most = signs[:, None] * np.eye(3)[axes], signs * self.limits[::-1][sides, axes]
-        names = ("upper", "lower")
-        self._rows = tuple(f"{names[side]} side in {_XYZ[axis]}" for side, axis in zip(sides, axes, strict=True))
+        axes, signs, self._most, sides = finite_sides(self.limits)
+        self._outward = signs[:, None] * np.eye(3)[axes]
+        self._rows = tuple(f"{side} side in {_XYZ[axis]}" for side, axis in zip(sides, axes, strict=True))
 
 
 class _OfSphere(_Region):

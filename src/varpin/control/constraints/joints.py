@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from varpin.arrays import Floats, Integers
-from varpin.control.constraints.base import LENGTH, BoundConstraint, Horizon, OfStates, PlanConstraint
+from varpin.control.constraints.base import LENGTH, BoundConstraint, Horizon, OfStates, PlanConstraint, finite_sides
 from varpin.errors import InputError
 from varpin.model import Robot, joint_unit
 from varpin.support.checks import (
@@ -41,14 +41,10 @@ class _WithinLimits(OfStates):
         name = type(self).__name__
         own = (-robot.velocity_limit, robot.velocity_limit) if self.in_velocity else robot.position_limits
         self.limits = some_limits(name, limits, own, robot.name, robot.joint_names)
-        # Upper limits, then lower ones.
-        sides, columns = np.nonzero(np.isfinite(self.limits[::-1]))
-        self._columns, self._signs = columns + self.in_velocity * robot.dof, np.where(sides == 0, 1.0, -1.0)
-        self._bounds = self._signs * self.limits[::-1][sides, columns]
-        names = ("upper", "lower")
-        self._rows = tuple(
-            f"{names[side]} limit of {robot.joint_names[c]}" for side, c in zip(sides, columns, strict=True)
-        )
+        columns, self._signs, self._bounds, sides = finite_sides(self.limits)
+        self._columns = columns + self.in_velocity * robot.dof
+        joints = (robot.joint_names[c] for c in columns)
+        self._rows = tuple(f"{side} limit of {joint}" for side, joint in zip(sides, joints, strict=True))
         self._unit = joint_unit(robot, sorted(set(columns.tolist())), speed=self.in_velocity)
         ranges = self.limits[1] - self.limits[0]
         whole = ranges[np.isfinite(ranges) & (ranges > 0.0)]
