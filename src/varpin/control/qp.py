@@ -92,15 +92,12 @@ class Program:
         found = form.solve(np.concatenate(b), np.concatenate(h))
         if found is None:
             return None
-        z, (own, push) = (
-            found.x[form.rank],
-            (
-                iter(np.split(self._scale * part, np.cumsum([len(piece) for piece in some[:-1]]))[1:])
-                for part, some in ((found.y, b), (found.z_u, h))
-            ),
-        )
-        multipliers = tuple(next(own) if equality else next(push) for equality in self._equalities)
-        return Minimum(z[:size], multipliers, float(z[size:].sum()))
+        z, multipliers = found.x[form.rank], list[Floats]()
+        pushes = {True: found.y[still.size :], False: found.z_u}
+        for equality, c in zip(self._equalities, values, strict=True):
+            own, pushes[equality] = np.split(pushes[equality], [len(c)])
+            multipliers.append(self._scale * own)
+        return Minimum(z[:size], tuple(multipliers), float(z[size:].sum()))
 
     def _form(self, weight: float | None) -> _Form:
         """The matrices of the program with hard rows, or of a weight."""

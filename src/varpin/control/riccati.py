@@ -119,7 +119,7 @@ def _pass(steps: Steps, given: Recursion, regularization: float, *, second: bool
         running = squares_of(given.gradient, given.hessian)
         if final is None or running is None:
             return None
-        found = RootPass(m, final.after(end.slopes).padded(X), gradient)
+        found = RootPass(m, final.after(steps.slopes[-1]).padded(X), gradient)
         failed = found.run(problem.dt, problem.hold, float(regularization), running=running, **arrays)
     else:
         found = core.BackwardPass(m, gradient, hessian)

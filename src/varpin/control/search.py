@@ -349,7 +349,7 @@ class Search:
         hessian = end.hessian.copy()
         for item in self.bound:
             if item.source.equality:
-                J = item.jacobian(self.trajectory.q, self.trajectory.v)[-1] @ end.slopes / item.scale
+                J = item.jacobian(self.trajectory.q, self.trajectory.v)[-1] @ made.slopes[-1] / item.scale
                 hessian += max(abs(self.cost), self.first) * J.T @ J
         vars(made)["terminal"] = end._replace(hessian=hessian)
         self._passes += 1

@@ -66,12 +66,11 @@ def _form(hessian: Floats, z: Floats) -> Floats:
 
 
 class Terminal(NamedTuple):
-    """The terminal cost in (q, v), its gradient (2n,) and Hessian (2n, 2n) in x, and d(q, v)/dx (2n, 2n)."""
+    """The terminal cost in (q, v), and its gradient (2n,) and Hessian (2n, 2n) in x."""
 
     cost: Expansion
     gradient: Floats
     hessian: Floats
-    slopes: Floats
 
 
 def states_of(problem: OptimalControlProblem) -> int:
@@ -241,7 +240,7 @@ class Steps:
         # Contiguous, as the core takes them.
         cost = Expansion(end.gradient[:1, x], np.ascontiguousarray(end.hessian[:1, x, x]))
         D = self.slopes[-1]
-        return Terminal(cost, D.T @ cost.gradient[0], D.T @ cost.hessian[0] @ D, D)
+        return Terminal(cost, D.T @ cost.gradient[0], D.T @ cost.hessian[0] @ D)
 
     @cached_property
     def rate(self) -> tuple[Floats, Floats]:

@@ -51,11 +51,6 @@ class Horizon(Frozen):
         """N."""
         return len(self.t) - 1
 
-    @property
-    def places(self) -> tuple[Integers, Floats]:
-        """All nodes but the first, whose state is given, and their times."""
-        return np.arange(1, self.steps + 1), self.t[1:]
-
 
 @dataclass(frozen=True, eq=False)
 class BoundConstraint(Frozen, ABC):
@@ -159,8 +154,8 @@ class OfStates(PlanConstraint):
 
     def bind(self, horizon: Horizon) -> BoundConstraint:
         require_same(self.label, self.robot, horizon.robot)
-        last = slice(-1 if self.equality else 0, None)
-        places, times = horizon.places[0][last], horizon.places[1][last]
+        places = np.arange(horizon.steps if self.equality else 1, horizon.steps + 1)
+        times = horizon.t[places]
         return BoundStates(self, places, times, self._rows, self._unit, self._scale, self.at(times))
 
     def at(self, times: Floats) -> Self:  # noqa: ARG002
