@@ -438,6 +438,10 @@ def test_the_same_problem_otherwise():
     problem = small(hold=2)
     assert problem.at(integrator=vp.RungeKutta4(), sampling="start", hold=5).decisions == 4
     assert_array_equal(problem.at(q0=[1, 2]).q0, [1, 2])
+    moved = problem.at(q0=[1, 2], t0=1.0)
+    assert moved.integrator == problem.integrator
+    assert moved.integrator_by_default
+    assert not problem.at(integrator=vp.Gauss(2)).integrator_by_default
     for dt in (0.3, 3.0):
         with refused(vp.InputError, "dt"):
             problem.at(dt=dt)

@@ -52,13 +52,8 @@ class BoundBetween(BoundConstraint):
         """See :meth:`BoundConstraint.value`; for one motion. Infinite where a step fails in parts."""
         if self.ends is None:
             return self.of.values(*self._states(q, v))
-        found: Floats = self._in_parts(self._given(q, v, u)[None])[0]
+        found: Floats = self._in_parts(_given(self.problem, q, v, u, self.places - 1)[None])[0]
         return found
-
-    def _given(self, q: Floats, v: Floats, u: Floats) -> Floats:
-        """The state before each step and its controls (K, 2n + c)."""
-        begin = self.places - 1
-        return np.concatenate([q[begin], v[begin], _controls(self.problem, u, begin)], axis=1)
 
     def _in_parts(self, given: Floats) -> Floats:
         """Values (S, K, rows) for states before the steps and their controls (S, K, 2n + c); infinite if one fails."""
@@ -77,7 +72,7 @@ class BoundBetween(BoundConstraint):
         Raises:
             LinearizationError: A step fails in parts.
         """
-        given = self._given(q, v, u)
+        given = _given(self.problem, q, v, u, self.places - 1)
         shifts = _SHIFT * np.eye(given.shape[1] + 1, given.shape[1], -1)
         values = self._in_parts(given + shifts[:, None])
         if not np.isfinite(values).all():
@@ -199,9 +194,10 @@ def followed(problem: OptimalControlProblem, instants: Instants, motion: Traject
     return Instants(np.array([item[:2] for item in found]), np.array([item[2] for item in found]))
 
 
-def _controls(problem: OptimalControlProblem, u: Floats, steps: Integers) -> Floats:
-    """Controls (K, m) of steps, or (K, 2m) at both ends where they are linear, from those of all."""
-    return np.concatenate([u[steps], u[steps + 1]], axis=1) if problem.linear else u[steps]
+def _given(problem: OptimalControlProblem, q: Floats, v: Floats, u: Floats, steps: Integers) -> Floats:
+    """The states before K steps and their controls (K, 2n + c), c = 2m at both ends where they are linear, else m."""
+    ends = [u[steps], u[steps + 1]] if problem.linear else [u[steps]]
+    return np.concatenate([q[steps], v[steps], *ends], axis=1)
 
 
 def _in_parts(problem: OptimalControlProblem, given: Floats) -> tuple[Floats, Floats] | None:
@@ -231,8 +227,7 @@ def _seen(problem: OptimalControlProblem, motion: Trajectory) -> dict[int, Float
     Minus infinity in the first step where the start violates the constraint. Empty where a step fails in parts.
     """
     steps, bounds = np.arange(motion.steps), watched(problem)
-    u = _controls(problem, problem.control_rows(motion), steps)
-    given = np.concatenate([motion.q[:-1], motion.v[:-1], u], axis=1)
+    given = _given(problem, motion.q, motion.v, problem.control_rows(motion), steps)
     parts = _in_parts(problem, given) if bounds else None
     if parts is None:
         return {}
