@@ -230,6 +230,12 @@ class Collocation {
     std::vector<double> element_curvature;  // (n) of the elements' potentials, if there is an elimination
     std::vector<double> diagonal;           // (n) of N, without the contributions of bodies in an elimination
 
+    // Whether a first iterate is improved though its residual is small: a guess may be as good as the tolerance.
+    template <class Equation>
+    static bool improves_first(double worst, bool jets_wanted) {
+        return !Equation::bordered && !jets_wanted && worst > 0.0;
+    }
+
     // Newton's method, as in `solve`, on this equation or on one that borders it with constraints: their impulses may
     // be far from the root where the velocities are not.
     template <class Equation>
@@ -239,8 +245,7 @@ class Collocation {
         bool fresh = true;
         for (int iteration = 0; iteration < Equation::most_corrections + 2; ++iteration) {
             worst = equation.evaluate(h, start, fresh, effort);
-            const bool first = !Equation::bordered && iteration == 0 && !jets_wanted && worst > 0.0;
-            if (worst <= tolerance && !first) {
+            if (worst <= tolerance && !(iteration == 0 && improves_first<Equation>(worst, jets_wanted))) {
                 if (fresh || !jets_wanted) break;
                 fresh = true;
                 continue;
