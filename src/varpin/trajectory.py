@@ -324,7 +324,7 @@ class Trajectory(Frozen):
         )
 
     @property
-    def rows(self) -> list[tuple[str, object]]:
+    def overview(self) -> list[tuple[str, object]]:
         """The motion as names and texts: its steps, its error and its energies."""
         change = self.energy - self.energy[0]
         kinetic = 0.5 * (self.p * self.v).sum(axis=1).max()
@@ -342,7 +342,7 @@ class Trajectory(Frozen):
 
     def _repr_html_(self) -> str:
         warnings = [("warning", warning) for warning in self.warnings]
-        rows = [("integrator", self.integrator), *self.rows, *warnings]
+        rows = [("integrator", self.integrator), *self.overview, *warnings]
         ends = zip(self.joint_names, self.q[0], self.q[-1], self.q.min(axis=0), self.q.max(axis=0), strict=True)
         speeds = np.abs(self.v).max(axis=0)
         joints = [(name, *map(float, row), float(speed)) for (name, *row), speed in zip(ends, speeds, strict=True)]

@@ -116,7 +116,7 @@ def _run(
 def _summary(trajectory: Trajectory, wall_time: float, written: Iterable[tuple[str, object]]) -> Table:
     """A table of a run: its settings, work, result and files."""
     rows = [
-        *trajectory.rows,
+        *trajectory.overview,
         ("wall time", f"{wall_time:.3g} s"),
         ("q at the end [rad or m]", "  ".join(f"{x:.6g}" for x in trajectory.q[-1])),
         ("v at the end [rad/s or m/s]", "  ".join(f"{x:.6g}" for x in trajectory.v[-1])),

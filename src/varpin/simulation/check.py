@@ -283,16 +283,6 @@ def _noise(
     return scene.silence, found.reshape(1, N * parts, 2, n)
 
 
-def _first_wrong(scene: Scene, q: Floats, off: Floats) -> int:
-    """The first node whose error is told, as a share of the travel up to it: what is wrong travels far."""
-    first, found = -1, len(q) - 1
-    while found != first:
-        first = found
-        until = slice(first + 1)
-        found = int((off[until] > TOLD * travel_scales(scene, q[until])).any(axis=1).argmax())
-    return first
-
-
 def error_findings(
     scene: Scene,
     integrator: Integrator,
@@ -313,7 +303,7 @@ def error_findings(
     joint = int(shares.max(axis=0).argmax())
     share = float(shares[:, joint].max())
     if share > TOLD:
-        worst, first = int(shares[:, joint].argmax()), _first_wrong(scene, q, off[:last])
+        worst, first = int(shares[:, joint].argmax()), int((shares > TOLD).any(axis=1).argmax())
         unit = joint_unit(scene.robot, joint)
         value = float(off[worst, joint])
         part = f", {100.0 * share:.2g} % of the largest travel" if share < 1.0 else ""
