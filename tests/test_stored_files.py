@@ -7,6 +7,9 @@ import dataclasses
 import functools
 import os
 import pickle
+import socket
+import subprocess
+import sys
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -210,6 +213,19 @@ def test_names_that_are_too_long_are_refused_by_name(tmp_path):
     for call in (motion.save, vp.Trajectory.load, vp.load_scene, vp.load_robot):
         with pytest.raises(vp.VarpinError, match="aaaa"):
             call(tmp_path / f"{'a' * 300}.npz")
+
+
+def test_what_a_killed_save_left_is_gone_after_the_next(tmp_path):
+    """And what another process that runs is writing stays."""
+    motion = vp.Trajectory.load(DATA / "trajectory.npz")
+    words = "import os, pathlib, signal, sys\nfrom varpin.io.archive import atomic_file\n"
+    words += "with atomic_file(pathlib.Path(sys.argv[1])): os.kill(os.getpid(), signal.SIGKILL)"
+    subprocess.run([sys.executable, "-c", words, tmp_path / "a.npz"], check=False)
+    assert len(list(tmp_path.iterdir())) == 1
+    running = tmp_path / f".varpin-{socket.gethostname()}-{os.getppid()}-0123456789abcdef"
+    running.touch()
+    motion.save(tmp_path / "a.npz")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [running.name, "a.npz"]
 
 
 @pytest.fixture(scope="module")

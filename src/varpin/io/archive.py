@@ -13,6 +13,7 @@ import io
 import os
 import reprlib
 import secrets
+import socket
 import typing
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -267,11 +268,18 @@ def _entries(kind: Any, prefix: str) -> Iterator[tuple[Any, str, Any]]:
 
 @contextlib.contextmanager
 def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A binary stream whose contents replace ``path`` when the block ends, and are deleted on an error."""
+    """A binary stream whose contents replace ``path`` when the block ends without an error, and are deleted otherwise.
+
+    What processes that were killed in such a block have left in the folder is deleted, too.
+    """
     target = writable(path)
+    host = socket.gethostname()
     # Not tempfile, whose files only their owner can read.
-    draft = target.with_name(f".varpin-{secrets.token_hex(8)}")
+    draft = target.with_name(f".varpin-{host}-{os.getpid()}-{secrets.token_hex(8)}")
     try:
+        for left in target.parent.glob(f".varpin-{host}-*-*"):
+            if not _runs(left.name.split("-")[-2]):
+                left.unlink(missing_ok=True)
         with draft.open("xb") as stream:
             yield stream
         draft.replace(target)
@@ -280,3 +288,14 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         if isinstance(error, OSError) and not isinstance(error, FileError):
             raise FileError(f"cannot write {target}: {error.strerror or error}") from None
         raise
+
+
+def _runs(process: str) -> bool:
+    """Whether a process of this machine runs."""
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        return False
+    except (ValueError, OverflowError, OSError):
+        return True
+    return True
