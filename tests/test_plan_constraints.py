@@ -603,13 +603,19 @@ def test_eight_points_are_a_box():
 
 
 @pytest.mark.parametrize(
-    ("points", "radius"), [(WEDGE, 0.0), (drum(), 0.0), (WEDGE[[1, 4]], 0.1)], ids=["wedge", "drum", "capsule"]
+    ("points", "made"),
+    [
+        (WEDGE, vp.Obstacle.convex(WEDGE)),
+        (drum(), vp.Obstacle.convex(drum())),
+        (WEDGE[[1, 4]], vp.Obstacle.capsule(*WEDGE[[1, 4]], 0.1)),
+        ((CUBE * [0.3, 0.2, 0.5]) @ TURN.T + [0.1, 0.2, 0.3], vp.Obstacle.box([0.1, 0.2, 0.3], [0.3, 0.2, 0.5], TURN)),
+    ],
+    ids=["wedge", "drum", "capsule", "box"],
 )
-def test_distances_are_those_of_least_squares(points, radius):
+def test_distances_are_those_of_least_squares(points, made):
     rng = np.random.default_rng(1)
     robot = vp.planar_chain(1)
     (R,), (p,) = frame_kinematics(robot, "joint1").placements(np.zeros((1, 1)))
-    made = vp.Obstacle.capsule(*points, radius) if radius else vp.Obstacle.convex(points)
     clear = 0
     for _ in range(40):
         segment = 0.7 * rng.normal(size=(2, 3))
@@ -618,7 +624,7 @@ def test_distances_are_those_of_least_squares(points, radius):
         known = least_distance(points, segment)
         if known > 1e-6:
             clear += 1
-            assert found == pytest.approx(known - 0.05 - radius, abs=1e-9)
+            assert found == pytest.approx(known - 0.05 - made.radius, abs=1e-9)
         else:
             assert found < -0.05 + 1e-6
     assert clear > 15

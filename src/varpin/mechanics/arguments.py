@@ -96,8 +96,8 @@ def acting_forces(
         if asked and value != "robot":
             raise InputError(f"{name} must be numbers, or 'robot' for those of the robot's description, got {value!r}")
         _warn_of_description(robot, name, name, gives=bool(own.any()), asked=asked, decided=decided)
-        given: JointValues = own if asked else 0.0 if value is None else value
-        return given
+        numbers: JointValues = own if asked else 0.0 if value is None else value
+        return numbers
 
     viscous = resistance("damping", damping, robot.damping, decided=damping is not None or JointDamper in kinds)
     # Numbers for the damping are a decision on the dry friction, too.

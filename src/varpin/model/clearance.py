@@ -117,10 +117,10 @@ class Obstacle(Frozen):
     @classmethod
     def box(cls, center: ArrayLike, sides: ArrayLike, rotation: ArrayLike | None = None, name: str = "box") -> Obstacle:
         """A box with ``sides`` (3,) [m] and ``center`` (3,) [m], turned by a ``rotation`` (3, 3)."""
-        size = finite_array(f"{name} sides", sides, (3,))
+        at, size = finite_array(f"{name} center", center, (3,)), finite_array(f"{name} sides", sides, (3,))
         if not (size > 0.0).all():
             raise InputError(f"{name} sides must be > 0 [m], got {size}")
-        return cls.convex(size * list(product((-0.5, 0.5), repeat=3)), center, rotation, name)
+        return cls.convex(size * list(product((-0.5, 0.5), repeat=3)), at, rotation, name)
 
     @classmethod
     def convex(
@@ -243,7 +243,8 @@ class Clearance(Frozen):
         """
         bodies = enumerate(self.obstacles, len(self.links))
         shifts = {i: body.shifts(times) for i, body in bodies if body.shift is not None}
-        return self.changed(shifts=shifts) if shifts else self
+        # The bodies and frames stay.
+        return self.changed(shifts=shifts, _shapes=self._shapes, _frames=self._frames) if shifts else self
 
     def distances(self, q: Floats) -> Floats:
         """The distance of each pair (N, pairs) [m] at q (N, n); negative where they overlap."""

@@ -129,7 +129,7 @@ def _example(name: str) -> Files | None:
     """The files of a robot of example-robot-data; None if there is none of this name."""
     folder = robots_dir()
     path = _files(folder).get(FIXED_BASE.get(name, name))
-    if path is None and name not in FIXED_BASE:
+    if name not in FIXED_BASE and (path is None or name in FIXED_BASE.values()):
         return None
     if folder is None:
         raise RobotError(f"robot {name!r} is in {_EXAMPLES}, which is not installed: pip install {_EXAMPLES}")
