@@ -73,6 +73,13 @@ def test_packages_elsewhere(package, tmp_path, monkeypatch):
             assert geometry(vp.load_robot(path)).ngeoms == 1
 
 
+@pytest.mark.parametrize("name", ["package://my_arm/Meshes/ball.obj", "../meshes/BALL.obj"])
+def test_a_file_in_other_case_is_named(package, name):
+    robot = vp.load_robot(two_links(package / "urdf", mesh(name)))
+    with refused(vp.RobotError, name, "ball.obj is there", "'l1'"):
+        geometry(robot)
+
+
 def test_every_link_is_named_and_where_was_looked(package, tmp_path, caplog):
     first = mesh("package://lost/a.stl") + mesh("package://my_arm/meshes/ball.obj")
     path = two_links(package / "urdf", first, mesh("b.stl") + mesh("http://c"))

@@ -316,9 +316,11 @@ def test_limits_of_followers_are_limits_of_their_leader(tmp_path, ratio, offset,
     assert vp.combine(robot, robot).position_limits[0] == pytest.approx([limits[0]] * 2)
 
 
-def test_limits_of_followers_that_leave_no_room_do_not_count(tmp_path):
+def test_followers_without_room_are_told(tmp_path, caplog):
     path = tree(tmp_path, ("j1 base a", ""), ("j2 a b", mimic("j1", 1, 5)))
     assert vp.load_robot(path).position_limits[0].tolist() == [-1.0]
+    assert naming(caplog.messages, "'j2'", "no room")
+    assert naming(vp.inspect_robot(path).warnings, "'j2'", "no room")
 
 
 def test_of_a_leader_that_is_not_there_stays_free(tmp_path, caplog):

@@ -218,11 +218,24 @@ def test_limits_on_a_continuous_joint_are_none(tmp_path):
     assert np.isinf(vp.load_robot(arm(tmp_path, kind="continuous")).position_limits).all()
 
 
+def test_limits_on_a_continuous_joint_are_told(tmp_path, caplog):
+    assert np.isinf(vp.load_robot(arm(tmp_path, kind="continuous")).position_limits).all()
+    assert naming(caplog.messages, "continuous", "'j1'")
+
+
 def test_one_line_for_many_joints(tmp_path, caplog):
     parts = [link(f"l{k}") + joint(f"j{k}", f"l{k - 1}" if k else "base", f"l{k}") for k in range(12)]
     vp.load_robot(written(tmp_path, write_urdf(tmp_path, *parts).read_text().replace('effort="9"', 'effort="-1"')))
     (line,) = caplog.messages
     assert len(line) < 240
+
+
+def test_soft_limits_and_misnamed_dynamics_are_told(tmp_path, caplog):
+    soft = '<safety_controller soft_lower_limit="-0.1" k_velocity="10"/>'
+    path = arm(tmp_path, inside=soft + '<joint_properties damping="0.2" friction="0.2"/>')
+    assert vp.load_robot(path).position_limits[0].tolist() == [-1.0]
+    assert naming(caplog.messages, "joint_properties", "dynamics", "'j1'")
+    assert naming(vp.inspect_robot(path).warnings, "safety_controller", "'j1'")
 
 
 @pytest.mark.parametrize("how", ["beside", "given"])

@@ -103,6 +103,8 @@ def load_robot(
         SingularMassMatrix: A joint moves no inertia, or a negative one.
     """
     robot = unchecked_robot(**locals())
+    for note in robot.notes:
+        logger.info("robot %r: %s", robot.name, note)
     wrong = (*robot.faults, *faults(robot.model, robot.inertials))
     for remark in (*robot.remarks, *wrong, *robot.limit_remarks()):
         logger.warning("robot %r: %s", robot.name, remark)

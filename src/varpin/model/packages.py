@@ -92,6 +92,19 @@ class Packages(Frozen):
         """The path of a file; None if it does not exist."""
         return next((path.absolute() for path in self.candidates(name) if path.is_file()), None)
 
+    def in_other_case(self, name: str) -> Path | None:
+        """A file whose path differs from ``name`` in upper and lower case alone; None if there is none."""
+        for path in map(Path.absolute, self.candidates(name)):
+            found = Path(path.anchor)
+            for part in path.parts[1:]:
+                exact = found / part
+                if not exact.exists() and found.is_dir():
+                    exact = next((own for own in found.iterdir() if own.name.lower() == part.lower()), exact)
+                found = exact
+            if found.is_file():
+                return found
+        return None
+
 
 def _named(manifests: Iterator[Path]) -> Iterator[tuple[str, Path]]:
     """Names and folders of packages."""

@@ -66,6 +66,7 @@ class Robot(Frozen):
         equalities: Equality constraints of an MJCF file; ``Scene(constraints="robot")`` takes them.
         inertials: Inertias of the links of a URDF, which the model merges into bodies.
         remarks: How the source is read where that is not plain, in words.
+        notes: What of the source has no effect on purpose, likewise.
         faults: What its masses lack, likewise.
     """
 
@@ -84,6 +85,7 @@ class Robot(Frozen):
     equalities: tuple[Equality, ...] = field(default=(), repr=False)
     inertials: tuple[Inertial, ...] = field(default=(), repr=False)
     remarks: tuple[str, ...] = field(default=(), repr=False)
+    notes: tuple[str, ...] = field(default=(), repr=False)
     faults: tuple[str, ...] = field(default=(), repr=False)
 
     def __repr__(self) -> str:
@@ -239,7 +241,8 @@ class Robot(Frozen):
         Two bounds of 0 count as none, since a URDF without limits is read so; to hold a joint still, lock it. A leader
         keeps within the limits of the mimic joints that follow it, unless they leave it no room.
         """
-        return self._limits[:2]
+        lower, upper, _, _ = self._limits[0]
+        return lower, upper
 
     @property
     def velocity_limit(self) -> Floats:
@@ -247,7 +250,7 @@ class Robot(Frozen):
 
         The bound of a mimic joint is one of its leader.
         """
-        return self._limits[2]
+        return self._limits[0][2]
 
     @property
     def effort_limit(self) -> Floats:
@@ -255,12 +258,12 @@ class Robot(Frozen):
 
         The bound of a mimic joint is one of its leader: what the leader exerts, the follower has to bear.
         """
-        return self._limits[3]
+        return self._limits[0][3]
 
     @cached_property
-    def _limits(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """All limits of the coordinates: lower, upper, of velocities, of efforts."""
-        lower, velocity = np.full(self.dof, -np.inf), np.full(self.dof, np.inf)
+    def _limits(self) -> tuple[tuple[Floats, Floats, Floats, Floats], tuple[str, ...]]:
+        """All limits of the coordinates, and the followers whose limits would leave their leader no room."""
+        lower, velocity, left_out = np.full(self.dof, -np.inf), np.full(self.dof, np.inf), []
         upper, effort, tree = velocity.copy(), velocity.copy(), self.tree
         for joint in (*self._coordinates, *(tie.follower for tie in self.ties)):
             c, ratio, offset = (values[joint - 1] for values in (tree.coordinate, tree.ratio, tree.offset))
@@ -272,16 +275,21 @@ class Robot(Frozen):
             low, high = max(low, lower[c]), min(high, upper[c])
             if joint in self._coordinates or low < high:
                 lower[c], upper[c] = low, high
+            else:
+                left_out.append(self.model.names[joint])
         limits = lower, upper, velocity, effort
         for limit in limits:
             limit.setflags(write=False)
-        return limits
+        return limits, tuple(left_out)
 
     def limit_remarks(self) -> Iterator[str]:
-        """A sentence about limits without room between them, if there are any."""
+        """What is odd about limits, one sentence a kind."""
         bounds = zip(self.joint_names, *self.position_limits, strict=True)
         if tight := [f"{low:g} and {high:g} of {name!r}" for name, low, high in bounds if not low < high]:
             yield f"limits leave no room to move (lock= holds a joint): {listed(tight, 'joints')}"
+        if names := self._limits[1]:
+            joints = listed(map(repr, names), "mimic joints")
+            yield f"limits that leave the joint that a mimic joint follows no room are left out: those of {joints}"
 
     @property
     def damping(self) -> Floats:

@@ -134,6 +134,7 @@ def _of_files(files: Files, *, tied: bool) -> Robot:
         loops=urdf.loops,
         inertials=urdf.inertials,
         remarks=(*urdf.remarks, *alone),
+        notes=urdf.notes,
         faults=urdf.faults,
     )
 

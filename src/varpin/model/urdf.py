@@ -69,6 +69,7 @@ class Urdf:
     inertials: tuple[Inertial, ...] = field(repr=False)  # of the links that have one
     faults: tuple[str, ...]  # what Pinocchio leaves out of links and joints, in words
     remarks: tuple[str, ...]  # how the file is read where that is not plain, one sentence a kind
+    notes: tuple[str, ...]  # what of the file has no effect on purpose, likewise
 
     @property
     def loops(self) -> tuple[tuple[str, str], ...]:
@@ -93,9 +94,11 @@ def read_urdf(path: Path, text: str | None = None) -> Urdf:
                 "varpin takes trees, no closed loops"
             )
     remarks = tuple(_remarks(root))
+    soft = _joints_with(root, "safety_controller")
+    notes = (f"soft limits of <safety_controller> have no effect: {listed(soft, 'joints')}",) if soft else ()
     model, inertials, complaint = _model(root, path)
     faults = (f"Pinocchio reads links in part: {complaint}",) if complaint else ()
-    return Urdf(path, root, model, inertials, faults, remarks)
+    return Urdf(path, root, model, inertials, faults, remarks, notes)
 
 
 def _model(root: ET.Element, path: Path) -> tuple[pin.Model, tuple[Inertial, ...], str]:
@@ -186,8 +189,10 @@ def build_shapes(
     if missing:
         links = listed((f"link {link!r}: {', '.join(files)}" for link, files in missing.items()), "links")
         places = ", ".join(map(str, packages.places)) or "no folder"
-        message = f"meshes of {urdf.path} are missing: {links}; looked beside the file and in {places}"
-        faults |= dict.fromkeys(missing, f"{message} (package_dirs=[...] adds)")
+        advice = f"looked beside the file and in {places} (package_dirs=[...] adds)"
+        if there := packages.in_other_case(next(iter(missing.values()))[0]):
+            advice = f"{there} is there, in other upper and lower case"
+        faults |= dict.fromkeys(missing, f"meshes of {urdf.path} are missing: {links}; {advice}")
     found = pin.GeometryModel()
     for shape in shapes.geometryObjects:
         if shape.name not in looks or looks[shape.name][0] not in faults:
@@ -226,7 +231,7 @@ def _remarks(root: ET.Element) -> Iterator[str]:
     """
     if left := _xacro(root):
         yield f"leftover xacro elements have no effect: {listed(left, 'kinds')}"
-    stated, none, degrees = root.get("version") == "1.2", [], []
+    stated, none, degrees, ignored = root.get("version") == "1.2", [], [], []
     for joint in root.findall("joint"):
         name, kind, limit = repr(joint.get("name", "")), joint.get("type"), joint.find("limit")
         if limit is None and kind in ("revolute", "prismatic"):
@@ -234,6 +239,8 @@ def _remarks(root: ET.Element) -> Iterator[str]:
         if limit is None:
             continue
         low, high = (_number(limit.get(key)) for key in ("lower", "upper"))
+        if kind == "continuous" and low < high and high - low < NO_LIMIT:
+            ignored.append(name)
         if kind == "revolute" and typed_in_degrees(np.array([low, high])).any():
             degrees.append(f"{low:g} to {high:g} of {name}")
         bounded, minus_one = bool({"lower", "upper"} & set(limit.keys())), low == high == -1.0
@@ -250,8 +257,16 @@ def _remarks(root: ET.Element) -> Iterator[str]:
                 none.append(f"no {key} of {name}" if word is None else f"{key} {word} of {name}")
     if degrees:
         yield f"limits look like degrees, and URDF has radians: {listed(degrees, 'joints')}"
+    if ignored:
+        yield f"limits of continuous joints have no effect (type revolute has limits): {listed(ignored, 'joints')}"
     if none:
         yield f"limits that are missing, infinite, negative or huge count as none: {listed(none, 'limits')}"
+    if named := _joints_with(root, "joint_properties"):
+        yield f"<joint_properties> has no effect, URDF calls it <dynamics>: {listed(named, 'joints')}"
+
+
+def _joints_with(root: ET.Element, tag: str) -> list[str]:
+    return [repr(joint.get("name", "")) for joint in root.findall(f"joint[{tag}]")]
 
 
 def _number(word: str | None) -> float:

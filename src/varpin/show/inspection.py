@@ -261,7 +261,7 @@ def inspect_robot(
 
 
 def _warnings(robot: Robot, links: Sequence[LinkReport], q: Floats, condition: float, *, meshes: bool) -> Iterator[str]:
-    yield from (*robot.faults, *robot.remarks, *robot.limit_remarks())
+    yield from (*robot.faults, *robot.remarks, *robot.notes, *robot.limit_remarks())
     shapes, unread = readable_geometry(robot) if meshes else (pin.GeometryModel(), {})
     yield from one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links, shapes)))
     yield from _mesh_warnings(robot, shapes)
