@@ -214,10 +214,6 @@ def test_limits_as_exporters_write_them(tmp_path, caplog, limit, read, facts):
     assert naming(told, (NONE, "'j1'") if NONE in facts else facts) == list(told)
 
 
-def test_limits_on_a_continuous_joint_are_none(tmp_path):
-    assert np.isinf(vp.load_robot(arm(tmp_path, kind="continuous")).position_limits).all()
-
-
 def test_limits_on_a_continuous_joint_are_told(tmp_path, caplog):
     assert np.isinf(vp.load_robot(arm(tmp_path, kind="continuous")).position_limits).all()
     assert naming(caplog.messages, "continuous", "'j1'")
