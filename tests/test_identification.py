@@ -9,6 +9,7 @@ from refusals import naming, refused
 
 import varpin as vp
 from varpin.estimation.consistency import Body
+from varpin.estimation.fit import simulations
 from varpin.estimation.parameters import parameters_of
 
 DAMPING = np.array([2.0, 1.5, 1.0, 0.3, 0.2, 0.1])
@@ -276,6 +277,25 @@ def test_ctrl_c_after_the_search_keeps_its_values(monkeypatch):
     assert np.isfinite(found.residuals[0]).all()
     monkeypatch.setattr("varpin.estimation.fit.Run.settled", interrupted)
     np.testing.assert_array_equal(vp.identify(start(), log(), NAMES, q_noise=NOISE).values, found.values)
+
+
+@pytest.mark.parametrize("searches", [0, 1])
+def test_ctrl_c_in_the_first_evaluation_of_a_search(searches, monkeypatch):
+    begun = set()
+
+    def interrupted(fit, stretches, y):
+        begun.add(len(stretches))
+        if len(begun) > searches:
+            raise KeyboardInterrupt
+        return simulations(fit, stretches, y)
+
+    monkeypatch.setattr("varpin.estimation.identification.simulations", interrupted)
+    found = vp.identify(start(), log(), NAMES, q_noise=NOISE)
+    assert found.status == "interrupted"
+    assert not naming(found.warnings, "cannot be simulated")
+    assert not found.null_space
+    assert (np.isfinite([*found.deviations, found.delay_deviation]) == bool(searches)).all()
+    assert not np.isnan(found.covariance).any()
 
 
 def test_a_value_at_its_bound_is_told_where_less_would_fit():

@@ -274,6 +274,22 @@ def test_a_motion_under_a_function_of_time_is_linearized():
         assert_allclose(lin.B[0, :, c], found, atol=1e-8 * np.abs(lin.B[0]).max())
 
 
+def test_a_divided_step_is_linearized_in_the_rate():
+    scene, begin = arm("cubic"), np.array([path(0.2), 20.0, rate(0.2)])
+
+    def step(u):
+        options = {"dt": 0.2, "steps": 1, "integrator": vp.Gauss(2), "check": False}
+        return vp.simulate(scene, Q0, [V0[0], 0.0, 8.0], controls=u[None], **options)
+
+    def end(u):
+        return np.append(step(u).q[1], step(u).p[1])
+
+    motion = step(begin)
+    assert motion.statistics.substeps[0] > 1
+    slopes = np.transpose([slope(end, begin, e, 1e-4) for e in np.eye(3)])
+    assert_allclose(vp.linearize(scene, motion).B[0], slopes, atol=1e-8 * np.abs(slopes).max())
+
+
 @over_interpolations
 @pytest.mark.parametrize("kind", ["rows", "lines"])
 def test_a_tolerance_divides_steps_as_the_input_moves(kind, interpolation):

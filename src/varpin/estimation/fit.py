@@ -106,6 +106,12 @@ class Fit:
         """Residuals and their derivatives in y, with those of the prior of bodies."""
         return np.concatenate([r, y[self.prior]]), np.concatenate([J, np.eye(self.size)[self.prior]])
 
+    @property
+    def cost(self) -> float:
+        """That of the best y so far; 0 before the first evaluation."""
+        r, _ = self.with_prior(self.rest, self.jacobian, self.best)
+        return float(r @ r)
+
     def values(self, y: Floats) -> tuple[Floats, Floats]:
         """The parameters' values (P,) and their derivatives in y (P, size)."""
         P = len(self.of.names)

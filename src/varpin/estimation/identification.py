@@ -218,7 +218,7 @@ def _made(fit: Fit, y: Floats, runs: Sequence[Run], apart: Sequence[Run], status
     scene, late, P = fit.of.scene_with(values), fit.late(y), len(fit.of.names)
     covariance, null = _covariance(fit, slopes)
     # Where the residuals are larger than the encoders' noise, the values are less certain by as much.
-    covariance = covariance * max(1.0, fit.least / len(fit.jacobian))
+    covariance = covariance * max(1.0, fit.cost / len(fit.jacobian))
     # Ctrl-C leaves out the motions and the check of the step that are not done, and keeps the values.
     every = [*runs, *apart]
     predicted, before = ([np.full(run.log.q.shape, np.nan) for run in every] for _ in range(2))
@@ -269,7 +269,8 @@ def _positions(run: Run, stretches: Sequence[Stretch], scene: Scene, late: float
 
 def _covariance(fit: Fit, slopes: Floats) -> tuple[Floats, tuple[str, ...]]:
     """The covariance of values and delay (size, size), and what the logs do not tell in sentences."""
-    J = fit.jacobian
+    # As many rows as columns, so that all that few samples leave open is in the null space.
+    J = np.pad(fit.jacobian, ((0, max(0, fit.size - len(fit.jacobian))), (0, 0)))
     sizes = np.linalg.norm(J, axis=0)
     scale = np.where(sizes > _NOTHING * sizes.max(initial=1.0), sizes, 1.0)
     _, spread, rows = np.linalg.svd(J / scale, full_matrices=False)
@@ -286,7 +287,7 @@ def _covariance(fit: Fit, slopes: Floats) -> tuple[Floats, tuple[str, ...]]:
     lost = np.abs((rows[~known] / scale) @ to.T).max(axis=0, initial=0.0) > _NAMED / scale.max()
     covariance[lost, :] = covariance[:, lost] = 0.0
     covariance[lost, lost] = np.inf
-    return covariance, tuple(_sentences(null, names))
+    return covariance, tuple(_sentences(null, names) if fit.done else ())
 
 
 def _sentences(null: Floats, names: Sequence[str]) -> list[str]:
@@ -324,7 +325,7 @@ def _step_error(fit: Fit, runs: Sequence[Run], y: Floats) -> Floats:
 
 def _doubts(fit: Fit, made: Identification, changes: Floats) -> Iterator[Finding]:
     """What is doubtful about the values, the worst first; ``changes`` (P,) are those by half the step."""
-    if fit.least >= LOST**2:
+    if fit.cost >= LOST**2:
         text = "motions with these values cannot be simulated: a column or its unit is wrong, or dt is too long"
         yield Finding("lost", text)
     misfits = list(_misfit(fit, made))
@@ -357,7 +358,7 @@ def _doubts(fit: Fit, made: Identification, changes: Floats) -> Iterator[Finding
 def _misfit(fit: Fit, made: Identification) -> Iterator[Finding]:
     """Residuals, or innovations under noise, that are larger than their noise."""
     if fit.of.scene.processes:
-        yield from misfit(fit.least, len(fit.jacobian))
+        yield from misfit(fit.cost, len(fit.jacobian))
         return
     squares = np.square(np.concatenate(made.residuals) / fit.deviation)
     there = np.isfinite(squares)
@@ -376,6 +377,6 @@ def _ended(fit: Fit) -> list[str]:
     """Parameters at their least values which the logs hold there, by more than noise would."""
     sizes = np.maximum(np.linalg.norm(fit.jacobian, axis=0), np.finfo(float).tiny)
     # By how many of its deviations each would be less if it were alone.
-    less = fit.rest @ fit.jacobian / sizes / max(1.0, np.sqrt(fit.least / len(fit.jacobian)))
+    less = fit.rest @ fit.jacobian / sizes / max(1.0, np.sqrt(fit.cost / len(fit.jacobian)))
     held = (fit.best <= fit.bounds[0]) & (less > _PULLED)
     return [name for name, told in zip(fit.of.names, held, strict=False) if told]

@@ -53,7 +53,6 @@ class ConstrainedStepper : public VariationalStepper {
     friend class ConstrainedLinearization;
 
     static constexpr double most_turn = 0.7;  // greatest relative change of C within a guarded substep
-    static constexpr double sure = 10.0;      // as Collocation's
     static constexpr int most_corrections = 12;
     static constexpr bool bordered = true;
 

@@ -204,14 +204,14 @@ class StepLinearization {
     }
 
   protected:
-    explicit StepLinearization(std::unique_ptr<VariationalStepper> made, int rates = 0)
+    explicit StepLinearization(std::unique_ptr<VariationalStepper> made)
         : stepper(std::move(made)),
           n(stepper->n),
           stages(stepper->stages),
           state(stepper->mechanism, stages),
           from(n),
           from_p(n),
-          chained(n, rates) {}
+          chained(n, static_cast<int>(stepper->mechanism.constraints.driven().size())) {}
 
     std::unique_ptr<VariationalStepper> stepper;
     int n, stages;
