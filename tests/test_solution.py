@@ -193,6 +193,7 @@ def test_paths_that_fail_are_counted():
     found = dataclasses.replace(vp.solve(quiet), problem=noisy).monte_carlo(16, 1)
     assert found.failures > 0
     assert found.paths + found.failures == 16
+    assert not unnamed(found.warnings[0], f"{found.failures} of 16 paths", "not counted")
     assert np.isfinite(found.cost)
 
 

@@ -39,15 +39,16 @@ _DOUBT = 3.0
 _SEARCH, _WARN = (0x76A3, 0), (0x76A3, 1)
 
 
-def _counted(plan: Solution, seed: tuple[int, ...], keep: int = 0) -> PolicyPaths:
-    """Motions of a plan's policy under noise, of which ``keep`` or as many as margins allow are kept at each row.
+def _counted(plan: Solution, seed: tuple[int, ...], *, largest: bool = False) -> PolicyPaths:
+    """Motions of a plan's policy under noise, with the ``largest`` values of each row, as many as margins allow.
 
     Raises:
         VarpinError: Fewer than half of the motions get to the end.
     """
     problem = plan.problem
     paths = _MOTIONS // 4 if problem.scene.noise.diffusion is None else _MOTIONS
-    keep = max(keep, *(math.ceil(paths * ndtr(-bound.source.margin)) for bound in with_margins(problem)))
+    beyond = (math.ceil(paths * ndtr(-bound.source.margin)) for bound in with_margins(problem))
+    keep = max(_ENOUGH, *beyond) if largest else 0
     every = PolicyPaths(problem, plan.policy, paths, np.random.default_rng(seed), keep=keep)
     with every.executing(None, None) as pool:
         every.simulate(pool)
@@ -70,7 +71,7 @@ def widened(plan: Solution) -> list[Floats] | None:
     if problem.scene.noise.diffusion is None or known is None:
         return None
     # The same noise in every count: what is left of a violation is then that of the plan, not of other noise.
-    counted = _counted(plan, _SEARCH, _ENOUGH).found
+    counted = _counted(plan, _SEARCH, largest=True).found
     finished, enough = counted.finished, True
     bounds = problem.bound_constraints
     added = [np.zeros(bound.shape) for bound in bounds] if known.added is None else split(bounds, known.added)

@@ -165,6 +165,14 @@ class PolicyPaths(Paths):
             tuple(_largest(np.concatenate(own), self.keep) for own in zip(*largest, strict=True)),
         )
 
+    def lost(self) -> tuple[Finding, ...]:
+        """A finding about the paths that have no cost, if there are any."""
+        lost = self.done - self.found.finished
+        if not lost:
+            return ()
+        told = f"{lost} of {self.done} paths could not be finished, and are not counted; a smaller dt may help"
+        return (Finding("failed paths", told),)
+
     def broken(self) -> tuple[Broken, ...]:
         """How often paths violated each constraint with a margin."""
         broken, found = [], self.found

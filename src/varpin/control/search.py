@@ -37,6 +37,7 @@ from varpin.errors import InputError, LinearizationError, StepError
 from varpin.integrators import Integrator
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.noise import NoiseFieldError
+from varpin.signals.commands import open_line, open_loop
 from varpin.simulation.failures import StepFailure, named
 from varpin.simulation.limits import saturates
 from varpin.simulation.record import Motions
@@ -517,18 +518,17 @@ class Search:
                 there = np.isfinite(limit) & (sign * (aim - limit) >= -TRACE * np.abs(limit))
                 u, gains = np.where(there, limit, u), np.where(there[:, :, None], 0.0, gains)
                 previous = None if previous is None else np.where(there[:, :, None], 0.0, previous)
-        x, before = states(problem, self.trajectory)[: -1 : problem.hold], np.zeros((0, len(now[0])))
+        x, limits = states(problem, self.trajectory)[: -1 : problem.hold], problem.control_limits
         if previous is not None:
             # The control before the first one is given.
             x = np.hstack([x, now[:-1] if problem.linear else np.vstack([now[:1], now[:-1]])])
             gains = np.concatenate([gains, previous], axis=2)
-        commands = Commands(u, gains, x, problem.hold, problem.control_limits, before)
         if not problem.linear:
-            return commands
+            return open_loop(u)._replace(gains=gains, reference=x, hold=problem.hold, limits=limits)
         # The first control has no feedback: its state is given.
-        first = problem.begun(np.clip(u[:1], *problem.control_limits))
-        times = np.array(problem.integrator.stage_times or (0.5,))
-        return commands._replace(u=u[1:], gains=gains[1:], before=first, stage_times=times)
+        u = np.vstack([problem.begun(np.clip(u[:1], *limits)), u[1:]])
+        line = open_line(u, problem.integrator.stage_times)
+        return line._replace(gains=gains[1:], reference=x, limits=limits)
 
     def _excess_of(self, values: Sequence[Floats]) -> list[Floats]:
         """Violations (P,) by values of all rows."""

@@ -247,7 +247,8 @@ def reports_on(
         outside = at_start(problem, whole)
         if outside is not None:
             # A row that is violated at the start cannot hold before the first node.
-            c[: fine.steps // problem.steps - 1, outside > 0.0] = 0.0
+            early = c[: fine.steps // problem.steps - 1]
+            np.minimum(early, 0.0, out=early, where=outside > 0.0)
         found.append(report_of(problem, bound, c))
     return found
 

@@ -125,7 +125,7 @@ class Ensemble(Printed, Frozen):
     def __str__(self) -> str:
         own = self.statistics
         energy = f"energy [J]: {own.energy_mean[-1]:.4g} +- {own.energy_deviation[-1]:.2g} in the end"
-        return "\n".join([repr(self), energy, *(f"warning: {own}" for own in self.warnings)])
+        return "\n".join([repr(self), energy, *(f"warning: {warning}" for warning in self.warnings)])
 
 
 class PathsInterrupted(KeyboardInterrupt):

@@ -39,6 +39,8 @@ logger = logging.getLogger(__name__)
 
 # Without stored paths, quantiles are those of as many of the first paths as have this many numbers, P (N + 1) 2n.
 _KEPT = 2**25
+# Quantiles are computed for runs of nodes with up to this many numbers; from 10,000 to 1,000,000.
+_SPAN = 100_000
 # Paths on which the integrator is chosen: one of every _OF, at most _CHOOSING.
 _OF, _CHOOSING = 16, 8
 
@@ -275,13 +277,17 @@ class Sums(Paths):
 
     def _quantiles(self) -> Floats:
         known, states, names = min(self.known, self.done), 2 * self.shared.scene.robot.dof, ("q", self.shared.second)
+        found = np.full((len(self.levels), self.shared.steps + 1, states), np.nan)
+        if not len(self.levels):
+            return found
+        nodes, span = self.nodes[:known], max(1, _SPAN // (known * states))
+        # Between two nodes at which paths fail, the set of paths is the same.
+        cuts = np.union1d(nodes, np.arange(0, nodes.max(), span)).tolist()
 
-        def of_node(node: int) -> Floats:
-            there = self.nodes[:known] > node
-            if not there.any():
-                return np.full((len(self.levels), states), np.nan)
-            x = np.concatenate([self.stored[name][:known, node][there] for name in names], axis=1)
-            return np.asarray(np.quantile(x, self.levels, axis=0))
+        def take(first: int, last: int) -> None:
+            x = np.concatenate([self.stored[name][:known, first:last] for name in names], axis=2)
+            found[:, first:last] = np.quantile(x[nodes >= last], self.levels, axis=0)
 
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            return np.stack(list(pool.map(of_node, range(self.shared.steps + 1))), axis=1)
+            list(pool.map(take, cuts[:-1], cuts[1:]))
+        return found
