@@ -172,7 +172,7 @@ REASONS = (
     ("no joint that moves", "no joint that moves"),
     ("FreeFlyer", "a free joint, which `lock` has to hold"),
     ("mass matrix is singular", "a joint that carries no inertia"),
-    ("has no name|needs a name", "a macro of xacro, which is no robot by itself"),
+    ("it has no links", "a macro of xacro, which is no robot by itself"),
     ("cannot be expanded", "a package or a file that is not there"),
     ("MuJoCo cannot read", "a fragment that other files include"),
 )

@@ -62,10 +62,11 @@ def interrupt(*_):
 def test_trajectory_is_what_the_options_say(arm, tmp_path, run):
     path = tmp_path / "motion.npz"
     options = "--q0 -0.5 2e-1 --v0 1 --gravity 0 -1e-1 -5 --damping elbow=0.2 --stiffness 3 --torque -1e-2 0.5"
+    options += " --friction 0.1"
     options += f" --integrator Midpoint(0.25) --dt 5e-3 --duration 0.5 --quiet --save {path}"
     run("simulate", arm, *options.split())
     saved = vp.Trajectory.load(path)
-    scene = vp.Scene(load_robot(arm), gravity=[0.0, -0.1, -5.0], damping=[0.0, 0.2], stiffness=3.0)
+    scene = vp.Scene(load_robot(arm), gravity=[0.0, -0.1, -5.0], damping=[0.0, 0.2], friction=0.1, stiffness=3.0)
     again = vp.simulate(
         scene, [-0.5, 0.2], [1.0, 1.0], dt=5e-3, steps=100, controls=[-0.01, 0.5], integrator=vp.Midpoint(alpha=0.25)
     )
@@ -116,6 +117,8 @@ MISTAKES = [
     ("simulate ARM --q0 elbow=1 2", ("--q0", "JOINT=VALUE")),
     ("simulate ARM --v0 elbow=1 elbow=2", ("--v0", "once", "elbow=2")),
     ("simulate ARM --lock elbow", ("--lock", "elbow", "JOINT=VALUE")),
+    ("simulate ARM --xacro-args dof", ("--xacro-args", "NAME=VALUE", "dof")),
+    ("simulate ARM --xacro-args dof=7", "xacro_args need a xacro file"),
     ("simulate ARM --save a.txt", ("--save", ".npz", "'a.txt'")),
     ("simulate nobody.urdf", "'nobody.urdf'"),
     ("advise ARM --tolerance 0", "tolerance"),
@@ -127,6 +130,7 @@ MISTAKES = [
     ("simulate scene.toml --dt 0.1", ("--dt", "scene file")),
     ("simulate scene.toml --no-gravity", ("--no-gravity", "scene file")),
     ("inspect scene.toml --lock dip=0", ("--lock", "scene file")),
+    ("inspect scene.toml --xacro-args a=1", ("--xacro-args", "scene file")),
     ("solve finger", "finger_tracking"),
     ("simulate scen.toml", "'scen.toml'"),
     ("solve scene.toml --resume none.npz", "none.npz"),

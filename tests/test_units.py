@@ -97,7 +97,7 @@ def test_a_passed_limit_is_that_of_the_robot(end, words):
     motion = vp.simulate(scene, [0.0], [2.0], dt=1e-3, steps=1000)
     (told,) = about(motion.warnings, "position limits")
     depth = motion.q.max() - 0.5
-    assert not unnamed(told, "0.5 rad", f"by {depth:.3g} at", words)
+    assert not unnamed(told, "0.5 rad", f"by up to {depth:.3g} (t = ", words)
     assert told.value == pytest.approx(depth, rel=1e-12)
 
 
@@ -109,7 +109,7 @@ def test_forces_beyond_effort_limits_are_told_of_by_what_reaches_the_joint():
     assert (told.kind, told.joint, told.unit) == ("effort limits", "joint1", "N")
     assert told.value == pytest.approx(3.0)
     assert told.time == pytest.approx(0.049)
-    assert not unnamed(told, "'joint1'", "9 N", "by 3", "t = 0.049 s")
+    assert not unnamed(told, "'joint1'", "9 N", "by up to 3", "t = 0.049 s")
 
 
 def test_plans_ensembles_and_controllers_tell_of_all_limits():

@@ -618,6 +618,11 @@ def test_arguments(workspace):
         vp.load_robot(workspace, xacro_args={"prefx": "left_"})
 
 
+def test_a_file_of_macros_is_told_from_a_robot(workspace, tmp_path):
+    with refused(vp.RobotError, "macros.xacro", "no links", "the one that calls them"):
+        vp.load_robot(tmp_path / "parts" / "macros.xacro")
+
+
 def test_packages_elsewhere(workspace, tmp_path, described):
     elsewhere = tmp_path / "not" / "near" / "it"
     elsewhere.mkdir(parents=True)

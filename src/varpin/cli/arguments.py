@@ -28,7 +28,7 @@ def add_robot(parser: argparse.ArgumentParser, *, scenes: bool = False) -> None:
 
 # Options that a scene file takes the place of.
 _OF_SCENES = (
-    *("lock", "package_dir", "dt", "tolerance", "duration", "steps", "integrator", "q", "v"),
+    *("lock", "package_dir", "xacro_args", "dt", "tolerance", "duration", "steps", "integrator", "q", "v"),
     *("q0", "v0", "gravity", "damping", "friction", "stiffness", "rest", "torque"),
 )
 
@@ -39,6 +39,8 @@ def add_robot_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lock", nargs="+", action="extend", metavar="JOINT=VALUE", help=text)
     text = "folder in which package:// paths of meshes are looked up; repeatable"
     parser.add_argument("--package-dir", action="append", metavar="DIR", help=text)
+    text = "arguments of a xacro file"
+    parser.add_argument("--xacro-args", nargs="+", action="extend", metavar="NAME=VALUE", help=text)
 
 
 def robot_options(request: argparse.Namespace) -> dict[str, Any]:
@@ -46,7 +48,11 @@ def robot_options(request: argparse.Namespace) -> dict[str, Any]:
     lock = values_of("lock", request.lock)
     if not isinstance(lock, dict | None):
         raise InputError(f"--lock takes JOINT=VALUE, for example elbow=0.5, got {' '.join(request.lock)}")
-    return {"package_dirs": request.package_dir, "lock": lock or {}}
+    pairs = [word.partition("=") for word in request.xacro_args or ()]
+    if not all(equals for _, equals, _ in pairs):
+        raise InputError(f"--xacro-args takes NAME=VALUE, for example dof=7, got {' '.join(request.xacro_args)}")
+    arguments = {name: value for name, _, value in pairs}
+    return {"package_dirs": request.package_dir, "lock": lock or {}, "xacro_args": arguments or None}
 
 
 def add_motion(parser: argparse.ArgumentParser) -> None:
@@ -57,11 +63,16 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
     add_vector(start, "v0", "initial velocity [rad/s or m/s]; default: 0")
     surroundings = parser.add_argument_group("surroundings")
     add_gravity(surroundings)
-    text = "viscous damping [N m s/rad or N s/m], or 'robot' for that of the robot's description; default: 0"
-    add_vector(surroundings, "damping", text)
+    add_losses(surroundings)
     add_vector(surroundings, "stiffness", "joint springs [N m/rad or N/m]; default: 0")
     add_vector(surroundings, "rest", "rest positions of the springs [rad or m]; default: 0")
     add_vector(surroundings, "torque", "constant generalized forces [N m or N]; default: 0")
+
+
+def add_losses(group: argparse._ActionsContainer) -> None:
+    """Add what damps joints."""
+    for name, text in (("damping", "viscous damping [N m s/rad or N s/m]"), ("friction", "dry friction [N m or N]")):
+        add_vector(group, name, f"{text}, or 'robot' for that of the robot's description; default: 0")
 
 
 def add_vector(group: argparse._ActionsContainer, name: str, text: str) -> None:
@@ -124,7 +135,7 @@ def motion_of(request: argparse.Namespace) -> tuple[Scene, ArrayLike, ArrayLike,
     """The scene, q0, v0, and the torque unless it is zero."""
     robot = load_robot(request.robot, **robot_options(request))
     given: dict[str, Any] = {}
-    for name in ("damping", "stiffness", "rest", "q0", "v0", "torque"):
+    for name in ("damping", "friction", "stiffness", "rest", "q0", "v0", "torque"):
         values = values_of(name, getattr(request, name))
         if isinstance(values, str):
             given[name] = robot.posture(values) if name == "q0" else values

@@ -15,8 +15,8 @@ from varpin.arrays import Floats
 from varpin.cli.arguments import (
     add_gravity,
     add_integrator,
+    add_losses,
     add_robot,
-    add_vector,
     integrator_of_words,
     names_scene,
     robot_options,
@@ -64,8 +64,7 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
     add_integrator(parser, default="Gauss(stages=2)")
     begin = parser.add_argument_group("begin")
     add_gravity(begin)
-    for name, text in (("damping", "viscous damping [N m s/rad or N s/m]"), ("friction", "dry friction [N m or N]")):
-        add_vector(begin, name, f"{text}, or 'robot' for that of the robot's description; default: 0")
+    add_losses(begin)
     add_files(parser, "URDF", "write the robot's URDF with the values", "draw measured positions, before and after")
 
 

@@ -117,6 +117,8 @@ def _model(root: ET.Element, path: Path) -> tuple[pin.Model, tuple[Inertial, ...
         name = path.name.removesuffix(".xacro").removesuffix(".urdf")
         raise RobotError(f"{path} is a xacro file, to be expanded: name it {name}.urdf.xacro ({complaint})")
     if model is None:
+        if root.find("link") is None:
+            complaint += " (it has no links: of a file of xacro macros, load the one that calls them)"
         raise RobotError(f"{path} is not a URDF: {complaint}")
     bodies = {frame.name for frame in model.frames if frame.type == pin.FrameType.BODY}
     if lost := [repr(link.get("name")) for link in root.findall("link") if link.get("name") not in bodies]:
