@@ -66,8 +66,8 @@ def _passed(
     stopped = kind == 0 and any((2 * upper - 1) * (stop[upper] - limit) < stop[-1] for stop in stops)
     soft = "; its JointStop gives way" if stopped else "; nothing stops it there" if kind == 0 else ""
     text = (
-        f"joint {name!r} passes its {what} limit {limit:.4g} {unit} by up to {by:.3g} (t = {trajectory.t[peak]:.3g} s{soft})"
-        f"{and_more(int((worst > 0).sum()) - 1, 'joint')}"
+        f"joint {name!r} passes its {what} limit {limit:.4g} {unit} by up to {by:.3g} "
+        f"(t = {trajectory.t[peak]:.3g} s{soft}){and_more(int((worst > 0).sum()) - 1, 'joint')}"
     )
     return Finding(KINDS[kind], text, name, time=float(trajectory.t[peak]), value=float(by), unit=unit)
 
