@@ -255,17 +255,15 @@ class Clearance(Frozen):
         """Derivatives of the distances in q (N, pairs, n), from the nearest points of each pair."""
         points, normals = np.empty((2, len(q), len(self.pairs), 3))
         for row, results in enumerate(self._results(q)):
-            for p, result in enumerate(results):
-                points[row, p], normals[row, p] = result.getNearestPoint1(), result.normal
+            points[row] = [own.getNearestPoint1() for own in results]
+            normals[row] = [own.normal for own in results]
+        wrenches, pairs = np.concatenate([normals, np.cross(points, normals)], axis=2), np.array(self.pairs)
         found = np.zeros((*points.shape[:2], q.shape[1]))
-        jacobians = {i: frame.jacobians(q) for i, frame in self._frames.items()}
-        for p, pair in enumerate(self.pairs):
-            for i, along in zip(pair, (-normals[:, p], normals[:, p]), strict=True):
-                if i in jacobians:
-                    _, origin, J = jacobians[i]
-                    # The nearest point of the second body is on the same line.
-                    lever = np.cross(points[:, p] - origin, along)
-                    found[:, p] += np.einsum("Na,Nan->Nn", along, J[:, :3]) + np.einsum("Na,Nan->Nn", lever, J[:, 3:])
+        for i, frame in self._frames.items():
+            _, origin, J = frame.jacobians(q)
+            # Of what is at the world's origin; the nearest point of a second body is on the line of the first one's.
+            J[:, :3] += np.cross(origin[:, :, None], J[:, 3:], axis=1)
+            found += ((pairs == i) @ [-1.0, 1.0])[:, None] * (wrenches @ J)
         return found
 
     @cached_property
@@ -287,19 +285,21 @@ class Clearance(Frozen):
             shapes.addCollisionPair(pin.CollisionPair(*pair))
         return shapes
 
-    def _results(self, q: Floats) -> Iterator[Any]:
+    def _results(self, q: Floats) -> Iterator[list[Any]]:
         """What coal finds of each pair, for each row of q; valid until the next row."""
         model, shapes, request = self.robot.model, self._shapes, coal.DistanceRequest()
         request.gjk_tolerance = request.epa_tolerance = _TOLERANCE
         data, at = model.createData(), shapes.createData()
         for p in range(len(self.pairs)):
             at.distanceRequests[p] = request
+        # Python takes longer to find the results than coal does.
+        results = list(at.distanceResults)
         for row, configuration in enumerate(self.robot.configuration(q)):
             pin.updateGeometryPlacements(model, data, shapes, at, configuration)
             for i, shifts in self.shifts.items():
                 at.oMg[i].translation = at.oMg[i].translation + shifts[row % len(shifts)]
             pin.computeDistances(shapes, at)
-            yield at.distanceResults
+            yield results
 
 
 def _joint(robot: Robot, frame: str) -> int:
