@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
-from varpin.model.meshes import joined, read_mesh, shape_points
+from varpin.model.meshes import MeshPart, joined, read_mesh, shape_points
 from varpin.model.robot import Robot, readable_geometry
 from varpin.model.tree import frame_of, z_to
 from varpin.model.urdf import read_xml
@@ -44,15 +44,7 @@ _EDGES = 254
 _TOLERANCE = 1e-10
 
 
-@dataclass(frozen=True, eq=False)
-class Hull(Frozen):
-    """A convex polyhedron. Made by :func:`hull_around`."""
-
-    points: Floats  # its vertices (P, 3) [m]
-    faces: NDArray[np.int64]  # indices of the vertices of its triangles (F, 3), anticlockwise from outside
-
-
-def hull_around(name: str, points: ArrayLike) -> Hull:
+def hull_around(name: str, points: ArrayLike) -> MeshPart:
     """The convex hull of points (N, 3) [m], N >= 4."""
     given = as_floats(name, points)
     if given.ndim != 2 or given.shape[1] != 3 or len(given) < 4:
@@ -75,7 +67,7 @@ def hull_around(name: str, points: ArrayLike) -> Hull:
     most = int(np.bincount(faces.ravel()).max())
     if most > _EDGES:
         raise InputError(f"{name} have a hull with {most} edges at one vertex, more than {_EDGES}: give fewer points")
-    return Hull(corners, faces)
+    return MeshPart(corners, faces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +128,7 @@ class Obstacle(Frozen):
         """
         at = finite_array(f"{name} position", position, (3,))
         R = np.eye(3) if rotation is None else rotation_matrix(f"{name} rotation", rotation)
-        return cls(str(name), hull_around(f"{name} points", points).points, 0.0, at, R)
+        return cls(str(name), hull_around(f"{name} points", points).vertices, 0.0, at, R)
 
     @classmethod
     def mesh(
@@ -166,7 +158,7 @@ class Obstacle(Frozen):
             return coal.Capsule(self.radius, length) if length > 0.0 else coal.Sphere(self.radius)
         hull = hull_around(self.name, self.points)
         points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
-        points.extend(hull.points)
+        points.extend(hull.vertices)
         triangles.extend(coal.Triangle(*map(int, face)) for face in hull.faces)
         return coal.Convex(points, triangles)
 
@@ -230,10 +222,10 @@ class Clearance(Frozen):
         return tuple(f"{bodies[i].name} and {bodies[k].name}" for i, k in self.pairs)
 
     @property
-    def capsules(self) -> dict[str, tuple[Floats, Floats, float]]:
+    def capsules(self) -> dict[str, tuple[list[float], list[float], float]]:
         """Ends and radius of the capsules of the links that joints move, by name."""
-        moving = (link for link in self.links if _joint(self.robot, link.name))
-        return {link.name: (link.points[0], link.points[1], link.radius) for link in moving}
+        moving = (self.links[i] for i in self._frames)
+        return {link.name: (*link.points.tolist(), link.radius) for link in moving}
 
     def over(self, times: Floats) -> Clearance:
         """The same with the obstacles at times (K,) [s].
