@@ -13,13 +13,14 @@ from varpin.arrays import Floats
 from varpin.control.constraints import KeepInBox, ReachFrame, WithinJointLimits
 from varpin.control.costs import TrackingCost
 from varpin.control.costs.base import BoundTerm
+from varpin.control.history import percent
 from varpin.control.margins import too_small
 from varpin.control.noise import covariances, noise_cost
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.sizes import FEASIBLE, HARMLESS, NOTABLE, SLIGHT, TRACE
 from varpin.control.solution import Solution
 from varpin.control.stages import Feedback, Steps
-from varpin.control.verification import Played, excess, in_parts, percent, replays
+from varpin.control.verification import Played, excess, in_parts, replays
 from varpin.core import Subject
 from varpin.errors import VarpinError
 from varpin.finding import Finding, announce, ranked

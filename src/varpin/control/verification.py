@@ -10,6 +10,7 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
+from varpin.control.history import percent
 from varpin.control.multipliers import ConstraintReport
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.sizes import NOTABLE
@@ -182,13 +183,6 @@ def excess(cost: float, base: float) -> float:
     if cost == base:
         return 0.0
     return (cost - base) / abs(base) if base != 0.0 else float(np.copysign(np.inf, cost - base))
-
-
-def percent(part: float) -> str:
-    """A fraction as text: in percent, or as a multiple where it is large."""
-    if abs(part) >= 1e4:
-        return f"{part:+.1e} x"
-    return f"{100.0 * part:+.2f} %" if abs(part) < 1.0 else f"{100.0 * part:+.0f} %"
 
 
 def verify(

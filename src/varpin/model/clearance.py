@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError
-from varpin.model.kinematics import FrameKinematics, frame_kinematics
 from varpin.model.meshes import MeshPart, joined, read_mesh, shape_points
 from varpin.model.robot import Robot, readable_geometry
 from varpin.model.tree import frame_of, z_to
@@ -36,8 +35,6 @@ from varpin.support.frozen import Frozen
 
 coal = pin.coal
 
-# A hull whose least thickness is below this share of its greatest extent is flat.
-_FLAT = 1e-9
 # coal counts the edges that meet in a vertex with 8 bits.
 _EDGES = 254
 # coal's tolerance; its own of 1e-6 leaves errors of 4e-7 m in distances to some hulls, and of 1e-3 in their direction.
@@ -49,15 +46,10 @@ def hull_around(name: str, points: ArrayLike) -> MeshPart:
     given = as_floats(name, points)
     if given.ndim != 2 or given.shape[1] != 3 or len(given) < 4:
         raise InputError(f"{name} must have shape (N, 3) with N >= 4, got {given.shape}")
-    require_finite(name, given)
-    extents = np.linalg.svd(given - given.mean(axis=0), compute_uv=False)
-    flat = InputError(f"{name} lie in a plane, and a hull needs a volume: give points on both sides of it")
-    if extents[2] <= _FLAT * extents[0]:
-        raise flat
     try:
-        found = scipy.spatial.ConvexHull(given)
+        found = scipy.spatial.ConvexHull(require_finite(name, given))
     except scipy.spatial.QhullError:
-        raise flat from None
+        raise InputError(f"{name} lie in a plane, and a hull needs a volume: give points on both sides of it") from None
     place = np.full(len(given), -1)
     place[found.vertices] = np.arange(len(found.vertices))
     corners, faces = given[found.vertices], place[found.simplices]
@@ -224,7 +216,7 @@ class Clearance(Frozen):
     @property
     def capsules(self) -> dict[str, tuple[list[float], list[float], float]]:
         """Ends and radius of the capsules of the links that joints move, by name."""
-        moving = (self.links[i] for i in self._frames)
+        moving = (link for link in self.links if _joint(self.robot, link.name))
         return {link.name: (*link.points.tolist(), link.radius) for link in moving}
 
     def over(self, times: Floats) -> Clearance:
@@ -235,34 +227,37 @@ class Clearance(Frozen):
         """
         bodies = enumerate(self.obstacles, len(self.links))
         shifts = {i: body.shifts(times) for i, body in bodies if body.shift is not None}
-        # The bodies and frames stay.
-        return self.changed(shifts=shifts, _shapes=self._shapes, _frames=self._frames) if shifts else self
+        # The bodies stay.
+        return self.changed(shifts=shifts, _shapes=self._shapes, _moved=self._moved) if shifts else self
 
     def distances(self, q: Floats) -> Floats:
         """The distance of each pair (N, pairs) [m] at q (N, n); negative where they overlap."""
-        found = [[result.min_distance for result in results] for results in self._results(q)]
+        found = [[own.min_distance for own in results] for results, _ in self._results(q)]
         return np.array(found).reshape(len(q), len(self.pairs))
 
     def slopes(self, q: Floats) -> Floats:
         """Derivatives of the distances in q (N, pairs, n), from the nearest points of each pair."""
-        points, normals = np.empty((2, len(q), len(self.pairs), 3))
-        for row, results in enumerate(self._results(q)):
+        model, n = self.robot.model, q.shape[1]
+        (points, normals), J = np.empty((2, len(q), len(self.pairs), 3)), np.empty((len(q), 6, model.nv))
+        for row, (results, data) in enumerate(self._results(q)):
             points[row] = [own.getNearestPoint1() for own in results]
             normals[row] = [own.normal for own in results]
-        wrenches, pairs = np.concatenate([normals, np.cross(points, normals)], axis=2), np.array(self.pairs)
-        found = np.zeros((*points.shape[:2], q.shape[1]))
-        for i, frame in self._frames.items():
-            _, origin, J = frame.jacobians(q)
-            # Of what is at the world's origin; the nearest point of a second body is on the line of the first one's.
-            J[:, :3] += np.cross(origin[:, :, None], J[:, 3:], axis=1)
-            found += ((pairs == i) @ [-1.0, 1.0])[:, None] * (wrenches @ J)
+            # Of what is at the world's origin.
+            J[row] = pin.computeJointJacobians(model, data)
+        # The nearest point of the second body is on the same line.
+        along = np.concatenate([normals, np.cross(points, normals)], axis=2) @ J
+        first, second = np.array(self.pairs).T
+        found: Floats = along * (self._moved[second] - self._moved[first]) @ self.robot.velocity(np.eye(n)).T
         return found
 
     @cached_property
-    def _frames(self) -> dict[int, FrameKinematics]:
-        """The frames of the links that joints move."""
-        moving = ((i, link.name) for i, link in enumerate(self.links) if _joint(self.robot, link.name))
-        return {i: frame_kinematics(self.robot, name) for i, name in moving}
+    def _moved(self) -> Floats:
+        """1 where a joint of the robot's model moves a body, else 0 (bodies, joints)."""
+        model = self.robot.model
+        found = np.zeros((len(self.links) + len(self.obstacles), model.njoints))
+        for i, link in enumerate(self.links):
+            found[i, list(model.supports[_joint(self.robot, link.name)])] = 1.0
+        return found[:, 1:]
 
     @cached_property
     def _shapes(self) -> pin.GeometryModel:
@@ -277,8 +272,8 @@ class Clearance(Frozen):
             shapes.addCollisionPair(pin.CollisionPair(*pair))
         return shapes
 
-    def _results(self, q: Floats) -> Iterator[list[Any]]:
-        """What coal finds of each pair, for each row of q; valid until the next row."""
+    def _results(self, q: Floats) -> Iterator[tuple[list[Any], pin.Data]]:
+        """What coal finds of each pair, and where joints are, for each row of q; valid until the next row."""
         model, shapes, request = self.robot.model, self._shapes, coal.DistanceRequest()
         request.gjk_tolerance = request.epa_tolerance = _TOLERANCE
         data, at = model.createData(), shapes.createData()
@@ -291,7 +286,7 @@ class Clearance(Frozen):
             for i, shifts in self.shifts.items():
                 at.oMg[i].translation = at.oMg[i].translation + shifts[row % len(shifts)]
             pin.computeDistances(shapes, at)
-            yield results
+            yield results, data
 
 
 def _joint(robot: Robot, frame: str) -> int:
