@@ -63,8 +63,8 @@ Shape = Literal["held", "linear"]
 # Greatest natural frequency of the feedback of first motions, times the period of controls; from 0.1 to 0.5.
 FASTEST = 0.25
 # All that another problem may have in place of its own.
-_KEPT = ("cost", "q0", "v0", "t0", "dt", "steps", "integrator", "sampling", "hold", "controls", "control_limits",
-         "constraints", "between_nodes")  # fmt: skip
+_KEPT = ("cost", "dt", "steps", "hold", "controls", "between_nodes", "sampling", "q0", "v0", "t0", "control_limits",
+         "constraints", "integrator")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -251,25 +251,23 @@ class OptimalControlProblem(Frozen):
         return next((before for before in (known, *limits) if before is not None), None)
 
     @property
-    def begin(self) -> Floats | None:
-        """The first control (m,) where controls are linear between nodes, NaN where it is free; None if all are.
+    def begin(self) -> Floats:
+        """The first control (m,) where it is given, NaN where it is free; all are where controls are held.
 
         It is given where a limit of the rate begins with a control before the horizon: lines do not jump. Of a
         kinematic input it is where the joint is.
         """
-        scene, found = self.scene, None
-        if self.linear and scene.inputs:
-            found = as_moved(scene, self.q0, self.v0, np.full(scene.controls, np.nan))
+        found = np.full(self.scene.controls, np.nan)
+        if self.linear:
+            found = as_moved(self.scene, self.q0, self.v0, found)
         for item in self.bound_constraints if self.linear else ():
             if isinstance(item, BoundRate) and item.before is not None:
-                found = np.full(scene.controls, np.nan) if found is None else found
                 found[item.limited] = np.clip(item.before, *self.control_limits)[item.limited]
         return found
 
     def begun(self, u: Floats) -> Floats:
         """Controls of decisions (R, m) whose first one is :attr:`begin` where that is given."""
-        given = self.begin
-        return u if given is None else np.vstack([np.where(np.isnan(given), u[0], given), u[1:]])
+        return np.vstack([np.where(np.isnan(self.begin), u[0], self.begin), u[1:]])
 
     @property
     def decisions(self) -> int:
@@ -348,16 +346,13 @@ class OptimalControlProblem(Frozen):
 
         Constraints are their values on a path from the start that turns all joints: functions of time have no names.
         """
-        names = ("dt", "steps", "hold", "controls", "between_nodes", "sampling", "q0", "v0", "t0", "control_limits")
-        found: dict[str, Any] = {name: getattr(self, name) for name in names}
+        found: dict[str, Any] = {name: getattr(self, name) for name in _KEPT if name != "cost"}
+        found["integrator"] = repr(self.integrator)
+        found["constraints"] = ", ".join(item.label for item in self.constraints)
         found["joints"] = ", ".join(self.scene.robot.joint_names)
         values = {name: array for name, array in self.scene.values.items() if not name.startswith("noise.")}
         found |= {f"scene.{name}": array for name, array in values.items()}
         found |= {f"noise.{name}": array for name, array in self.scene.diffusion._asdict().items()}
-        found |= {
-            "constraints": ", ".join(item.label for item in self.constraints),
-            "integrator": repr(self.integrator),
-        }
         path = 0.1 * np.sin(np.outer(np.arange(self.steps + 1), 1.0 + np.arange(len(self.q0))))
         q, v = self.q0 + path, self.v0 + path
         u = np.zeros((self.steps + self.linear, self.scene.controls))

@@ -143,26 +143,18 @@ class Obstacle(Frozen):
         return cls.convex(points, position, rotation, Path(path).stem if name is None else name)
 
     @property
-    def shape(self) -> Any:
-        """The body for coal."""
-        length = float(np.linalg.norm(self.points[-1] - self.points[0]))
-        if len(self.points) <= 2:
-            return coal.Capsule(self.radius, length) if length > 0.0 else coal.Sphere(self.radius)
-        hull = hull_around(self.name, self.points)
-        points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
-        points.extend(hull.vertices)
-        triangles.extend(coal.Triangle(*map(int, face)) for face in hull.faces)
-        return coal.Convex(points, triangles)
-
-    @property
-    def placement(self) -> pin.SE3:
-        """Placement of :attr:`shape`, whose z axis is that of a capsule, before the obstacle moves."""
+    def body(self) -> tuple[Any, pin.SE3]:
+        """The body for coal, and its placement before the obstacle moves."""
         if len(self.points) > 2:
-            return pin.SE3(self.rotation, self.position)
+            hull, points, triangles = hull_around(self.name, self.points), coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+            points.extend(hull.vertices)
+            triangles.extend(coal.Triangle(*map(int, face)) for face in hull.faces)
+            return coal.Convex(points, triangles), pin.SE3(self.rotation, self.position)
         way = self.points[-1] - self.points[0]
         length = float(np.linalg.norm(way))
-        middle = 0.5 * (self.points[0] + self.points[-1])
-        return pin.SE3(z_to(way / length) if length > 0.0 else self.rotation, self.position + middle)
+        # A capsule is along its z axis.
+        axes = z_to(way / length) if length > 0.0 else self.rotation
+        return coal.Capsule(self.radius, length), pin.SE3(axes, self.position + self.points.mean(axis=0))
 
     def moving(self, shift: Callable[[float], ArrayLike]) -> Obstacle:
         """The obstacle displaced by ``shift(t)`` (3,) [m] from its described position at each time t [s].
@@ -265,9 +257,9 @@ class Clearance(Frozen):
         model, shapes = self.robot.model, pin.GeometryModel()
         frames = [frame_of(model, link.name, self.robot.name) for link in self.links]
         frames += [model.frames[0]] * len(self.obstacles)
-        for i, (body, frame) in enumerate(zip((*self.links, *self.obstacles), frames, strict=True)):
-            place = frame.placement * body.placement
-            shapes.addGeometryObject(pin.GeometryObject(str(i), frame.parentJoint, place, body.shape))
+        for i, (own, frame) in enumerate(zip((*self.links, *self.obstacles), frames, strict=True)):
+            shape, place = own.body
+            shapes.addGeometryObject(pin.GeometryObject(str(i), frame.parentJoint, frame.placement * place, shape))
         for pair in self.pairs:
             shapes.addCollisionPair(pin.CollisionPair(*pair))
         return shapes
