@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, Self
 
@@ -321,7 +321,7 @@ class OptimalControlProblem(Frozen):
             t0 = finite("t0", given.get("t0", self.t0))
             q0, v0 = _start(self.scene, given.get("q0", self.q0), given.get("v0", self.v0), self.dt)
             found = self.changed(**given | {"q0": q0, "v0": v0, "t0": t0})
-            return found._bind(replace(self.running.points, t0=t0))
+            return found._bind(self.running.points.changed(t0=t0))
         same = {name: getattr(self, name) for name in _KEPT}
         if self.integrator_by_default:
             same["integrator"] = None
@@ -492,7 +492,7 @@ class OptimalControlProblem(Frozen):
 
     def decided(self, trajectory: Trajectory) -> Floats:
         """The controls (R, m) of a motion on the problem's grid, one row per decision."""
-        return trajectory.u_nodes if self.linear else trajectory.u[:: self.hold]
+        return self.control_rows(trajectory)[:: self.hold]
 
     def control_rows(self, trajectory: Trajectory) -> Floats:
         """The controls of a motion as :meth:`samples` takes them."""
@@ -636,7 +636,7 @@ def bind_cost(cost: Cost, times: Floats, horizon: Points) -> tuple[BoundSum, Bou
     """The running costs at ``times`` (N,) of a horizon, and the terminal costs at its end."""
     end = np.array([horizon.t0 + horizon.duration])
     running, terminal = (
-        CostSum(tuple(_placed(cost, at_end))).bind(replace(horizon, t=t)) for at_end, t in enumerate((times, end))
+        CostSum(tuple(_placed(cost, at_end))).bind(horizon.changed(t=t)) for at_end, t in enumerate((times, end))
     )
     return running, terminal
 
