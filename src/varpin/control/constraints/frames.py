@@ -7,14 +7,13 @@ from collections.abc import Callable
 from typing import Self
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.control.constraints.base import OfStates, finite_sides
 from varpin.errors import InputError
 from varpin.model import Robot
-from varpin.model.kinematics import frame_kinematics
+from varpin.model.kinematics import frame_kinematics, logarithms
 from varpin.support.checks import finite, finite_array, named_limits, over_time, positive, rotation_matrix
 
 _XYZ = ("x", "y", "z")
@@ -66,14 +65,14 @@ class ReachFrame(_OfFrame):
     def values(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
         R, p = self.kinematics.placements(q)
         found = [] if self.position is None else [p - self.position]
-        found += [] if self.rotation is None else [np.array([pin.log3(turn) for turn in self.rotation.T @ R])]
+        found += [] if self.rotation is None else [logarithms(self.rotation.T @ R)[0]]
         return np.concatenate(found, axis=1)
 
     def slopes(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
         R, _, J = self.kinematics.jacobians(q)
         found = [] if self.position is None else [J[:, :3]]
         if self.rotation is not None:
-            of_body = np.array([pin.Jlog3(turn) for turn in self.rotation.T @ R]) @ np.swapaxes(R, 1, 2)
+            of_body = logarithms(self.rotation.T @ R)[1] @ np.swapaxes(R, 1, 2)
             found.append(of_body @ J[:, 3:])
         return np.concatenate(found, axis=1)
 
