@@ -113,8 +113,8 @@ class SearchState:
 
 
 def percent(part: float) -> str:
-    """A fraction as text."""
-    return f"{100.0 * part:+.3g} %"
+    """A fraction as text, to a ten-thousandth of a percent."""
+    return f"{round(100.0 * part, 4) + 0.0:+.3g} %"
 
 
 @dataclass(frozen=True)

@@ -320,8 +320,10 @@ class OptimalControlProblem(Frozen):
         if moves:
             t0 = finite("t0", given.get("t0", self.t0))
             q0, v0 = _start(self.scene, given.get("q0", self.q0), given.get("v0", self.v0), self.dt)
-            found = self.changed(**given | {"q0": q0, "v0": v0, "t0": t0})
-            return found._bind(self.running.points.changed(t0=t0))
+            points = self.running.points
+            # A step alone has references of the whole horizon.
+            points = points.changed(t0=points.t0 - self.t0 + t0)
+            return self.changed(**given | {"q0": q0, "v0": v0, "t0": t0})._bind(points)
         same = {name: getattr(self, name) for name in _KEPT}
         if self.integrator_by_default:
             same["integrator"] = None
@@ -346,13 +348,14 @@ class OptimalControlProblem(Frozen):
 
         Constraints are their values on a path from the start that turns all joints: functions of time have no names.
         """
-        found: dict[str, Any] = {name: getattr(self, name) for name in _KEPT if name != "cost"}
-        found["integrator"] = repr(self.integrator)
-        found["constraints"] = ", ".join(item.label for item in self.constraints)
+        plain = (name for name in _KEPT if name not in ("cost", "constraints", "integrator"))
+        found: dict[str, Any] = {name: getattr(self, name) for name in plain}
         found["joints"] = ", ".join(self.scene.robot.joint_names)
         values = {name: array for name, array in self.scene.values.items() if not name.startswith("noise.")}
         found |= {f"scene.{name}": array for name, array in values.items()}
         found |= {f"noise.{name}": array for name, array in self.scene.diffusion._asdict().items()}
+        found["constraints"] = ", ".join(item.label for item in self.constraints)
+        found["integrator"] = repr(self.integrator)
         path = 0.1 * np.sin(np.outer(np.arange(self.steps + 1), 1.0 + np.arange(len(self.q0))))
         q, v = self.q0 + path, self.v0 + path
         u = np.zeros((self.steps + self.linear, self.scene.controls))

@@ -235,7 +235,7 @@ class Clearance(Frozen):
             points[row] = [own.getNearestPoint1() for own in results]
             normals[row] = [own.normal for own in results]
             # Of what is at the world's origin.
-            J[row] = pin.computeJointJacobians(model, data)
+            J[row] = pin.computeJointJacobians(model, data).reshape(6, -1)
         # The nearest point of the second body is on the same line.
         along = np.concatenate([normals, np.cross(points, normals)], axis=2) @ J
         first, second = np.array(self.pairs).T
