@@ -2,7 +2,7 @@
 
 import pickle
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -23,6 +23,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 import varpin as vp
 from varpin import replay
 from varpin.control.checks import foreseen
+from varpin.control.constraints import BoundConstraint
 from varpin.model.clearance import capsule_around, clearance
 from varpin.model.kinematics import frame_kinematics
 
@@ -335,6 +336,40 @@ def test_speeds_hold_between_nodes_at_least_cost(controls, close):
         constraints=rules, options={"maxiter": 50, "ftol": 1e-10},
     )  # fmt: skip
     assert abs(best.fun - plan.cost) <= close * plan.cost
+
+
+@dataclass(frozen=True, eq=False)
+class BoundSpeeds(BoundConstraint):
+    def value(self, q, v, u):
+        speeds = v[..., self.places, :]
+        return np.concatenate([speeds - LIMIT, -speeds - LIMIT], axis=-1)
+
+    def jacobian(self, q, v):
+        return np.tile(np.kron([[0.0, 1.0], [0.0, -1.0]], np.eye(2)), (len(self.places), 1, 1))
+
+
+class Speeds(vp.PlanConstraint):
+    """WithinVelocityLimits as a user would write them, at the last nodes."""
+
+    def __init__(self, nodes):
+        self.nodes = nodes
+
+    def bind(self, horizon):
+        places = np.arange(horizon.steps - min(self.nodes, horizon.steps), horizon.steps) + 1
+        return BoundSpeeds(self, places, horizon.t[places], ("a", "b", "c", "d"), "rad/s", 0.12)
+
+
+@pytest.mark.parametrize("controls", ["held", "linear"])
+def test_constraints_of_ones_own_hold_between_nodes_where_they_are_at_all(controls):
+    everywhere = vp.solve(in_speeds(constraints=Speeds(10**6), controls=controls))
+    known = vp.solve(in_speeds(controls=controls))
+    assert everywhere.status.converged
+    assert everywhere.cost == pytest.approx(known.cost, rel=1e-6)
+    assert speeds_of(everywhere.problem, everywhere.controls, 32).max() <= LIMIT + 2e-6
+    assert_allclose(everywhere.constraints[0].t, known.constraints[0].t, atol=1e-6)
+    late = vp.solve(in_speeds(constraints=Speeds(2), controls=controls))
+    assert_allclose(late.constraints[0].t, [DT * (N - 1), DT * N])
+    assert late.cost < known.cost
 
 
 def test_speeds_between_nodes_that_nobody_asks_for_are_told():

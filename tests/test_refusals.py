@@ -91,7 +91,11 @@ OF_COSTS = [
     (lambda: small(vp.ControlCost([1.0, 1.0, 1.0])), ("weight", "2", "(3,)")),
     (lambda: small(vp.TrackingCost(np.zeros((20, 2)))), ("(21, 2)", "(20, 2)")),
     (lambda: small(vp.TrackingCost([0.0, 0.0, 0.0])), ("(2,)", "(21, 2)", "(3,)")),
-    (lambda: small(vp.Terminal(vp.TrackingCost([0.0, np.nan]))), ("TrackingCost", "reference[1]", "nan")),
+    (lambda: vp.TrackingCost([0.0, np.nan]), ("TrackingCost", "reference[1]", "nan")),
+    (lambda: vp.FrameOrientationCost(TWO, "tip", 2.0 * np.eye(3)), "rotation"),
+    (lambda: vp.FrameOrientationCost(TWO, "tip", np.diag([1.0, 1.0, -1.0])), "rotation"),
+    (lambda: vp.FrameOrientationCost(TWO, "tip", np.full((3, 3), np.nan)), "finite"),
+    (lambda: vp.FrameOrientationCost(TWO, "tip", [np.eye(3), 2 * np.eye(3), np.eye(3)]), ("1", "rotation")),
 ]
 OF_CONSTRAINTS = [
     (lambda: reach(vp.JointTie("joint1", "joint2")), "varpin.Scene"),

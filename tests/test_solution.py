@@ -199,21 +199,21 @@ def test_paths_that_fail_are_counted():
 
 def test_verification_prints_the_loss_in_percent():
     text = str(vp.Verification(2.0, 2.5, 2.02, 0.125, 0.25, 8, 3e-11))
-    assert not unnamed(text, "2.000000e+00", "2.500000e+00", "+25.00 %", "1.25e-01")
-    assert not unnamed(text, "2.020000e+00", "+1.00 %", "2.50e-01", "3e-11")
+    assert not unnamed(text, "2.000000e+00", "2.500000e+00", "+25 %", "1.25e-01")
+    assert not unnamed(text, "2.020000e+00", "+1 %", "2.50e-01", "3e-11")
     assert about(text.splitlines()[-1], "legend")
     lost = str(vp.Verification(2.0, np.nan, np.nan, np.nan, np.nan, 8, np.inf))
     assert len(about(lost.splitlines(), "runaway")) == 3
     assert "nan" not in lost
     assert "inf" not in lost
     # Nothing is a part of a cost of nothing.
-    assert "+0.00 %" in str(vp.Verification(0.0, 0.0, 1e-9, 0.0, 0.0, 4, 0.0))
+    assert "+0 %" in str(vp.Verification(0.0, 0.0, 1e-9, 0.0, 0.0, 4, 0.0))
     assert vp.Verification(0.0, -1.0, 1.0, 0.0, 0.0, 4, 0.0).open_loop_loss == -np.inf
 
 
 def test_monte_carlo_prints_how_far_it_is_from_the_prediction():
     text = str(vp.MonteCarlo(cost=1.1, standard_error=0.05, predicted=1.0, paths=197, failures=3))
-    assert not unnamed(text, "1.100000e+00", "5.0e-02", "197", "3", "+10.00 %", "+2.0")
+    assert not unnamed(text, "1.100000e+00", "5.0e-02", "197", "3", "+10 %", "+2.0")
     assert about(text.splitlines()[-1], "legend")
     assert "standard errors)" not in str(vp.MonteCarlo(1.0, 0.0, 1.0, 2, 0))
 

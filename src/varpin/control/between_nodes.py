@@ -13,7 +13,7 @@ from typing import Annotated
 import numpy as np
 
 from varpin.arrays import Floats, Integers, Mask
-from varpin.control.constraints import BoundConstraint, BoundStates, OfStates
+from varpin.control.constraints import BoundConstraint
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.sizes import FEASIBLE, SLIGHT
 from varpin.errors import LinearizationError
@@ -39,19 +39,19 @@ class BoundBetween(BoundConstraint):
     Attributes:
         problem: The problem.
         moments: The instants in a step of unit length (K,).
-        of: The constraint at the instants.
-        ends: The constraint at the ends of parts of the K steps; None where values are on cubics.
+        of: The constraint at the instants, by :meth:`OptimalControlProblem.bound_at`.
+        ends: The same at the ends of parts of the K steps; None where values are on cubics.
     """
 
     problem: OptimalControlProblem
     moments: Floats
-    of: OfStates
-    ends: OfStates | None
+    of: BoundConstraint
+    ends: BoundConstraint | None
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """See :meth:`BoundConstraint.value`; for one motion. Infinite where a step fails in parts."""
         if self.ends is None:
-            return self.of.values(*self._states(q, v))
+            return self.of.of_states(*self._states(q, v))
         found: Floats = self._in_parts(_given(self.problem, q, v, u, self.places - 1)[None])[0]
         return found
 
@@ -63,7 +63,7 @@ class BoundBetween(BoundConstraint):
         if parts is None:
             return np.full((S, *self.shape), np.inf)
         steps = (x.reshape(S, len(first), *x.shape[1:])[:, index] for x in parts)
-        found = self.ends.values(*(x.reshape(-1, x.shape[3]) for x in steps))
+        found = self.ends.of_states(*(x.reshape(S, -1, x.shape[3]) for x in steps))
         return _on_parabolas(found.reshape(S, len(self.places), -1, len(self.rows)), self.moments)
 
     def slopes(self, q: Floats, v: Floats, u: Floats) -> Floats:
@@ -142,10 +142,9 @@ def enforced(problem: OptimalControlProblem, instants: Instants) -> OptimalContr
     for i in instants.constraints:
         item, steps, moments = problem.bound_constraints[i], *instants.of(i)
         times = problem.t0 + problem.dt * (steps + moments)
-        assert isinstance(item, BoundStates)
-        ends = None if instants.cubic else item.of.at(_times(problem, steps))
+        ends = None if instants.cubic else problem.bound_at(i, _times(problem, steps))
         given = item.source, steps + 1, times, item.rows, item.unit, item.scale
-        found.append(BoundBetween(*given, problem, moments, item.of.at(times), ends))
+        found.append(BoundBetween(*given, problem, moments, problem.bound_at(i, times), ends))
     return problem.changed(bound_constraints=tuple(found))
 
 
@@ -155,12 +154,9 @@ def _times(problem: OptimalControlProblem, steps: Integers) -> Floats:
     return found
 
 
-def watched(problem: OptimalControlProblem) -> dict[int, BoundStates]:
-    """The constraints that are to hold between nodes, by their index: inequalities of states."""
-    if not (problem.linear or problem.between_nodes):
-        return {}
-    bounds = enumerate(problem.bound_constraints)
-    return {i: item for i, item in bounds if isinstance(item, BoundStates) and not item.source.equality}
+def watched(problem: OptimalControlProblem) -> list[int]:
+    """Indices of the constraints that are to hold between nodes."""
+    return problem.throughout if problem.linear or problem.between_nodes else []
 
 
 def middles(problem: OptimalControlProblem) -> Instants:
@@ -226,15 +222,15 @@ def _seen(problem: OptimalControlProblem, motion: Trajectory) -> dict[int, Float
 
     Minus infinity in the first step where the start violates the constraint. Empty where a step fails in parts.
     """
-    steps, bounds = np.arange(motion.steps), watched(problem)
+    steps, found = np.arange(motion.steps), dict[int, Floats]()
     given = _given(problem, motion.q, motion.v, problem.control_rows(motion), steps)
-    parts = _in_parts(problem, given) if bounds else None
+    parts = _in_parts(problem, given) if watched(problem) else None
     if parts is None:
-        return {}
+        return found
     q, v = (x.reshape(-1, x.shape[2]) for x in parts)
-    times, found = _times(problem, steps), {}
-    for i, item in bounds.items():
-        found[i] = item.of.at(times).values(q, v).reshape(len(steps), PARTS + 1, -1)
+    for i in watched(problem):
+        values = problem.bound_at(i, _times(problem, steps)).of_states(q, v)
+        found[i] = values.reshape(len(steps), PARTS + 1, -1)
         if (found[i][0, 0] > FEASIBLE).any():
             found[i][0] = -np.inf
     return found

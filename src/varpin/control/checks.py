@@ -13,13 +13,14 @@ from varpin.arrays import Floats
 from varpin.control.constraints import KeepInBox, ReachFrame, WithinJointLimits
 from varpin.control.costs import TrackingCost
 from varpin.control.costs.base import BoundTerm
+from varpin.control.history import percent
 from varpin.control.margins import too_small
 from varpin.control.noise import covariances, noise_cost
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.sizes import FEASIBLE, HARMLESS, NOTABLE, SLIGHT, TRACE
 from varpin.control.solution import Solution
 from varpin.control.stages import Feedback, Steps
-from varpin.control.verification import Played, at_start, excess, in_parts, percent, replays
+from varpin.control.verification import Played, excess, in_parts, replays
 from varpin.core import Subject
 from varpin.errors import VarpinError
 from varpin.finding import Finding, announce, ranked
@@ -108,9 +109,9 @@ def _in_milliseconds(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 def _starts_outside(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Constraints that the start violates, so that the first step has to satisfy them."""
-    for bound in problem.bound_constraints:
-        c = at_start(problem, bound)
-        if c is not None and c[row := int(np.argmax(c))] > NOTABLE * bound.scale:
+    for i in problem.throughout:
+        bound, c = problem.bound_constraints[i], problem.at_start(i)
+        if c[row := int(np.argmax(c))] > NOTABLE * bound.scale:
             sentence = (
                 f"the start is outside {problem.label_of(bound.source)}, {bound.rows[row]} by {c[row]:.2g} "
                 f"{bound.unit}, and the first node after it has to be inside: begin inside, or widen the bound"
@@ -214,9 +215,9 @@ def _in_degrees(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 def _in_millimetres(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Regions and obstacles that are so far away at the start, or violated by so much, that they look like it."""
-    for bound in problem.bound_constraints:
-        c = at_start(problem, bound) if bound.unit == "m" else None
-        if c is None or isinstance(bound.source, WithinJointLimits):
+    for i in problem.throughout:
+        bound, c = problem.bound_constraints[i], problem.at_start(i)
+        if bound.unit != "m" or isinstance(bound.source, WithinJointLimits):
             continue
         order = np.argsort(np.abs(c))
         # One far side of a box may stand for none.
@@ -265,8 +266,9 @@ def _between(solution: Solution, again: Sequence[Played]) -> Iterator[Finding]:
     away = [np.abs(own.nodes - solution.trajectory.q).max() for own in again]
     if np.isnan(away).all():
         return
-    for bound, outside in zip(problem.bound_constraints, again[int(np.nanargmin(away))].outside, strict=True):
-        if bound.of_controls or bound.source.equality or outside.violation <= NOTABLE * bound.scale:
+    reports = again[int(np.nanargmin(away))].reports
+    for bound, outside in ((problem.bound_constraints[i], reports[i]) for i in problem.throughout):
+        if outside.violation <= NOTABLE * bound.scale:
             continue
         advice = "a smaller dt or a bound narrower by that much keeps it there"
         if not (problem.linear or problem.between_nodes):

@@ -112,9 +112,9 @@ class SearchState:
     rounds: int = 0
 
 
-def part(loss: float) -> str:
-    """A loss in percent, with two significant digits."""
-    return f"{100.0 * loss:+.2g} %"
+def percent(part: float) -> str:
+    """A fraction as text, to a ten-thousandth of a percent."""
+    return f"{round(100.0 * part, 4) + 0.0:+.3g} %"
 
 
 @dataclass(frozen=True)
@@ -153,9 +153,9 @@ class Refined:
     HEADER = "      dt  steps         cost    true cost       loss     excess  violation  iterations  time [s]"
 
     def __str__(self) -> str:
-        above = part(self.excess) if np.isfinite(self.excess) else ""
+        above = percent(self.excess) if np.isfinite(self.excess) else ""
         return (
-            f"{self.dt:8.3g} {self.steps:6d} {self.cost:12.6e} {self.true_cost:12.6e} {part(self.loss):>10} "
+            f"{self.dt:8.3g} {self.steps:6d} {self.cost:12.6e} {self.true_cost:12.6e} {percent(self.loss):>10} "
             f"{above:>10} {self.violation:10.1e} {self.iterations:11d} {self.seconds:9.2g}"
         )
 

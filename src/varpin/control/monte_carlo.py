@@ -13,8 +13,9 @@ from scipy.special import ndtr
 from varpin.arrays import Floats, Integers
 from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import CostSum
+from varpin.control.history import percent
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.verification import excess, percent
+from varpin.control.verification import excess
 from varpin.ensemble.paths import Part, Paths, Reduction, Shared, without_geometry
 from varpin.finding import Finding
 from varpin.mechanics.wiener import children

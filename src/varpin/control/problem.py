@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, Self
 
@@ -63,8 +63,8 @@ Shape = Literal["held", "linear"]
 # Greatest natural frequency of the feedback of first motions, times the period of controls; from 0.1 to 0.5.
 FASTEST = 0.25
 # All that another problem may have in place of its own.
-_KEPT = ("cost", "q0", "v0", "t0", "dt", "steps", "integrator", "sampling", "hold", "controls", "control_limits",
-         "constraints", "between_nodes")  # fmt: skip
+_KEPT = ("cost", "dt", "steps", "hold", "controls", "between_nodes", "sampling", "q0", "v0", "t0", "control_limits",
+         "constraints", "integrator")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -122,15 +122,15 @@ class OptimalControlProblem(Frozen):
     t0: float
     control_limits: Floats
     constraints: tuple[PlanConstraint, ...]
-    running: BoundSum = field(repr=False)
-    terminal: BoundSum = field(repr=False)
-    places: Floats = field(repr=False)
-    rule: Floats = field(repr=False)
-    rate: ControlRate | None = field(repr=False)
+    running: BoundSum
+    terminal: BoundSum
+    places: Floats
+    rule: Floats
+    rate: ControlRate | None
     controls: Shape
     between_nodes: bool
-    integrator_by_default: bool = field(repr=False)
-    bound_constraints: tuple[BoundConstraint, ...] = field(repr=False)
+    integrator_by_default: bool
+    bound_constraints: tuple[BoundConstraint, ...]
 
     def __init__(
         self,
@@ -183,20 +183,16 @@ class OptimalControlProblem(Frozen):
         if sampling != "gauss" and (linear or _cubic(scene)):
             what = "linear controls act" if linear else "a cubic KinematicInput acts"
             raise InputError(f"sampling = {sampling!r} misses the nodes, where {what}: leave it out, for 'gauss'")
-        t0, names = finite("t0", t0), scene.robot.joint_names
-        at, speed = joint_array("q0", q0, names), joint_array("v0", v0, names)
-        if scene.constraints:
-            at, speed, moved = on_constraints(scene, at, speed)
-            announce(logger, scene.announced, dt, moved)
+        t0, names, (q0, v0) = finite("t0", t0), scene.robot.joint_names, _start(scene, q0, v0, dt)
         note = "; those of the mechanism belong to varpin.Scene(constraints=)"
         vars(self).update(
             scene=scene,
             cost=cost,
-            q0=at,
-            v0=speed,
+            q0=q0,
+            v0=v0,
             dt=dt,
             steps=steps,
-            integrator=integrator_for(scene, at, dt) if integrator is None else integrator,
+            integrator=integrator_for(scene, q0, dt) if integrator is None else integrator,
             sampling=sampling,
             hold=hold,
             t0=t0,
@@ -255,25 +251,23 @@ class OptimalControlProblem(Frozen):
         return next((before for before in (known, *limits) if before is not None), None)
 
     @property
-    def begin(self) -> Floats | None:
-        """The first control (m,) where controls are linear between nodes, NaN where it is free; None if all are.
+    def begin(self) -> Floats:
+        """The first control (m,) where it is given, NaN where it is free; all are where controls are held.
 
         It is given where a limit of the rate begins with a control before the horizon: lines do not jump. Of a
         kinematic input it is where the joint is.
         """
-        scene, found = self.scene, None
-        if self.linear and scene.inputs:
-            found = as_moved(scene, self.q0, self.v0, np.full(scene.controls, np.nan))
+        found = np.full(self.scene.controls, np.nan)
+        if self.linear:
+            found = as_moved(self.scene, self.q0, self.v0, found)
         for item in self.bound_constraints if self.linear else ():
             if isinstance(item, BoundRate) and item.before is not None:
-                found = np.full(scene.controls, np.nan) if found is None else found
                 found[item.limited] = np.clip(item.before, *self.control_limits)[item.limited]
         return found
 
     def begun(self, u: Floats) -> Floats:
         """Controls of decisions (R, m) whose first one is :attr:`begin` where that is given."""
-        given = self.begin
-        return u if given is None else np.vstack([np.where(np.isnan(given), u[0], given), u[1:]])
+        return np.vstack([np.where(np.isnan(self.begin), u[0], self.begin), u[1:]])
 
     @property
     def decisions(self) -> int:
@@ -323,12 +317,17 @@ class OptimalControlProblem(Frozen):
             given["constraints"] = tuple(
                 item.changed(before=control) if isinstance(item, WithinControlRate) else item for item in kept
             )
+        if moves:
+            t0 = finite("t0", given.get("t0", self.t0))
+            q0, v0 = _start(self.scene, given.get("q0", self.q0), given.get("v0", self.v0), self.dt)
+            points = self.running.points
+            # A step alone has references of the whole horizon.
+            points = points.changed(t0=points.t0 - self.t0 + t0)
+            return self.changed(**given | {"q0": q0, "v0": v0, "t0": t0})._bind(points)
         same = {name: getattr(self, name) for name in _KEPT}
-        if self.integrator_by_default and not moves:
+        if self.integrator_by_default:
             same["integrator"] = None
-        found = OptimalControlProblem(self.scene, **same | given)
-        by_default = self.integrator_by_default and "integrator" not in given
-        return found.changed(integrator_by_default=by_default)
+        return OptimalControlProblem(self.scene, **same | given)
 
     def in_parts(self, parts: int) -> OptimalControlProblem:
         """The problem in ``parts`` of each step, for motions under commands that are decided as in its own steps.
@@ -349,16 +348,14 @@ class OptimalControlProblem(Frozen):
 
         Constraints are their values on a path from the start that turns all joints: functions of time have no names.
         """
-        names = ("dt", "steps", "hold", "controls", "between_nodes", "sampling", "q0", "v0", "t0", "control_limits")
-        found: dict[str, Any] = {name: getattr(self, name) for name in names}
+        plain = (name for name in _KEPT if name not in ("cost", "constraints", "integrator"))
+        found: dict[str, Any] = {name: getattr(self, name) for name in plain}
         found["joints"] = ", ".join(self.scene.robot.joint_names)
         values = {name: array for name, array in self.scene.values.items() if not name.startswith("noise.")}
         found |= {f"scene.{name}": array for name, array in values.items()}
         found |= {f"noise.{name}": array for name, array in self.scene.diffusion._asdict().items()}
-        found |= {
-            "constraints": ", ".join(item.label for item in self.constraints),
-            "integrator": repr(self.integrator),
-        }
+        found["constraints"] = ", ".join(item.label for item in self.constraints)
+        found["integrator"] = repr(self.integrator)
         path = 0.1 * np.sin(np.outer(np.arange(self.steps + 1), 1.0 + np.arange(len(self.q0))))
         q, v = self.q0 + path, self.v0 + path
         u = np.zeros((self.steps + self.linear, self.scene.controls))
@@ -388,11 +385,8 @@ class OptimalControlProblem(Frozen):
         self, dt: float, steps: int, hold: int, *, linear: bool | None = None
     ) -> tuple[BoundConstraint, ...]:
         """The constraints on another grid, and for controls that are ``linear`` between nodes or held."""
-        scene, before = self.scene, None if self.rate is None else self.rate.before
-        lines = self.linear if linear is None else linear
         times = self.t0 + np.arange(steps + 1, dtype=np.float64) * dt
-        horizon = Horizon(times, scene.robot, scene.controls, hold, scene.control_joints, before, lines)
-        bound = []
+        horizon, bound = self._horizon(times, hold, self.linear if linear is None else linear), []
         for i, item in enumerate(self.constraints):
             try:
                 bound.append(item.bind(horizon))
@@ -400,6 +394,27 @@ class OptimalControlProblem(Frozen):
                 error.add_note(f"in constraints[{i}]")
                 raise
         return tuple(bound)
+
+    def _horizon(self, times: Floats, hold: int, linear: bool) -> Horizon:
+        scene, before = self.scene, None if self.rate is None else self.rate.before
+        return Horizon(times, scene.robot, scene.controls, hold, scene.control_joints, before, linear)
+
+    @cached_property
+    def throughout(self) -> list[int]:
+        """Indices of the constraints that have values between nodes: inequalities of states at all but the first."""
+        every = np.arange(1, self.steps + 1)
+        bounds = [(i, own) for i, own in enumerate(self.bound_constraints) if not own.of_controls]
+        return [i for i, own in bounds if not own.source.equality and np.array_equal(own.places, every)]
+
+    def bound_at(self, index: int, times: Floats) -> BoundConstraint:
+        """A constraint ``throughout`` at times (K,) [s]: its places are the rows of states (..., K, n)."""
+        bound = self.constraints[index].bind(self._horizon(np.append(self.t0, times), 1, self.linear))
+        return bound.changed(places=np.arange(len(times)))
+
+    def at_start(self, index: int) -> Floats:
+        """The rows of a constraint ``throughout`` at the fixed start."""
+        start: Floats = self.bound_at(index, np.array([self.t0])).of_states(self.q0[None], self.v0[None])[0]
+        return start
 
     def label_of(self, constraint: PlanConstraint) -> str:
         """The name of one of the constraints in reports, with its index where several have the same name."""
@@ -480,7 +495,7 @@ class OptimalControlProblem(Frozen):
 
     def decided(self, trajectory: Trajectory) -> Floats:
         """The controls (R, m) of a motion on the problem's grid, one row per decision."""
-        return trajectory.u_nodes if self.linear else trajectory.u[:: self.hold]
+        return self.control_rows(trajectory)[:: self.hold]
 
     def control_rows(self, trajectory: Trajectory) -> Floats:
         """The controls of a motion as :meth:`samples` takes them."""
@@ -545,15 +560,9 @@ class OptimalControlProblem(Frozen):
         return np.concatenate([part.reshape(*q.shape[:-2], -1) for part in found], axis=-1)
 
     def not_finite(self, trajectory: Trajectory) -> tuple[Cost, ...]:
-        """The cost terms that are not finite on a motion; those of the controls' rate are not tested."""
-        q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
-        places = self.samples(q, v, u), (q[-1:], v[-1:], np.zeros((1, self.scene.controls)))
-        found = list[Cost]()
-        # The parts of both sums are in the order of the cost's terms.
-        for at_end, (bound, at) in enumerate(zip((self.running, self.terminal), places, strict=True)):
-            finite = [np.isfinite(part.value(*at)).all() for _, part in bound.parts]
-            found += [term for term, is_so in zip(_placed(self.cost, at_end), finite, strict=True) if not is_so]
-        return tuple(found)
+        """The cost terms that are not finite on a motion."""
+        alone = ((term, self.changed(cost=term)._bind(self.running.points)) for term in self.cost.terms)
+        return tuple(term for term, problem in alone if not np.isfinite(problem.shares(trajectory)).all())
 
     def simulate(
         self,
@@ -592,6 +601,16 @@ def require_problem(problem: object) -> OptimalControlProblem:
     return problem
 
 
+def _start(scene: Scene, q0: JointValues, v0: JointValues, dt: float) -> tuple[Floats, Floats]:
+    """The initial state, corrected where the scene has constraints."""
+    names = scene.robot.joint_names
+    q, v = joint_array("q0", q0, names), joint_array("v0", v0, names)
+    if scene.constraints:
+        q, v, moved = on_constraints(scene, q, v)
+        announce(logger, scene.announced, dt, moved)
+    return q, v
+
+
 def _rule(sampling: str, dt: float, *, cubic: bool) -> tuple[Floats, Floats]:
     """Sample points in a step of unit length (s,), and the coefficients of the samples (s, 9).
 
@@ -620,7 +639,7 @@ def bind_cost(cost: Cost, times: Floats, horizon: Points) -> tuple[BoundSum, Bou
     """The running costs at ``times`` (N,) of a horizon, and the terminal costs at its end."""
     end = np.array([horizon.t0 + horizon.duration])
     running, terminal = (
-        CostSum(tuple(_placed(cost, at_end))).bind(replace(horizon, t=t)) for at_end, t in enumerate((times, end))
+        CostSum(tuple(_placed(cost, at_end))).bind(horizon.changed(t=t)) for at_end, t in enumerate((times, end))
     )
     return running, terminal
 

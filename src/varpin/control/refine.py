@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from varpin.control.between_nodes import PARTS
-from varpin.control.history import Refined, Refinement, Status, part
+from varpin.control.history import Refined, Refinement, Status, percent
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.sizes import FEASIBLE, SLIGHT, TENTH
 from varpin.control.solution import Solution
@@ -177,8 +177,8 @@ class _Record:
         reason = f"true_cost = {self.wish:g} is not met: {ended}; " if ended else ""
         if self.tried:
             row = self.tried[chosen]
-            lost = f"loses {part(row.loss)}" if np.isfinite(row.loss) else "has no known true cost"
-            above = f"costs about {part(row.excess)} more than the optimum of finer controls"
+            lost = f"loses {percent(row.loss)}" if np.isfinite(row.loss) else "has no known true cost"
+            above = f"costs about {percent(row.excess)} more than the optimum of finer controls"
             above = above if np.isfinite(row.excess) else "is not compared with finer controls"
             # A plan that violates constraints is not compared.
             above = self.beyond if ended and self.beyond else above

@@ -309,8 +309,7 @@ class Search:
         problem, along, rows = self.problem, self.along, self.rows
         u, (lower, upper) = problem.decided(self.trajectory), problem.control_limits
         least, most = np.minimum(lower - u, 0.0), np.maximum(upper - u, 0.0)
-        if problem.begin is not None:
-            least[0], most[0] = (np.where(np.isnan(problem.begin), part[0], 0.0) for part in (least, most))
+        least[0], most[0] = (np.where(np.isnan(problem.begin), part[0], 0.0) for part in (least, most))
         program = Program(along, rows, (least, most), plan, self.regularization if rows else 0.0)
         self.program = program
         values, bad = self._values, self._badness

@@ -334,7 +334,7 @@ class Steps:
             gradient[decided] += pull @ change
             hessian[decided] += change.T @ rate @ change
         found, begin = Recursion(J, gradient, hessian, G, Gz), problem.begin
-        if begin is None:
+        if np.isnan(begin).all():
             return found
         fixed = np.zeros((N + first, m), dtype=bool)
         fixed[0] = ~np.isnan(begin)

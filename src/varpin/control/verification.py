@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
+from varpin.control.history import percent
 from varpin.control.multipliers import ConstraintReport
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.sizes import NOTABLE
@@ -33,12 +34,42 @@ _READING = (
 )
 
 
-class Played(NamedTuple):
-    """A motion under commands in parts of a plan's steps; all NaN where it diverges."""
+@dataclass(frozen=True, eq=False)
+class Played:
+    """A motion under commands in parts of a plan's steps.
 
+    Attributes:
+        problem: The plan's.
+        fine: The same :meth:`in_parts`.
+        motion: None where it diverges.
+        cost: NaN where it diverges.
+    """
+
+    problem: OptimalControlProblem
+    fine: OptimalControlProblem
+    motion: Trajectory | None
     cost: float
-    outside: list[ConstraintReport]
-    nodes: Floats  # configurations at the plan's nodes
+
+    @property
+    def nodes(self) -> Floats:
+        """Configurations at the plan's nodes (N + 1, n); NaN where it diverges."""
+        motion, N = self.motion, self.problem.steps
+        return np.full((1, 1), np.nan) if motion is None else motion.q[:: motion.steps // N]
+
+    @property
+    def reports(self) -> tuple[ConstraintReport, ...]:
+        """How well it satisfies each constraint, without margins; all NaN where it diverges."""
+        parts, found = self.fine.steps // self.problem.steps, []
+        for i, bound in enumerate(self.fine.bound_constraints):
+            c = np.full(bound.shape, np.nan)
+            if self.motion is not None:
+                c = bound.value(self.motion.q, self.motion.v, self.fine.control_rows(self.motion))
+            if i in self.problem.throughout:
+                # A row that is violated at the start cannot hold before the first node.
+                early = np.arange(len(c)) < parts - 1
+                c = np.where(early[:, None] & (self.problem.at_start(i) > 0.0), np.minimum(c, 0.0), c)
+            found.append(report_of(self.problem, bound, c))
+        return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -154,13 +185,6 @@ def excess(cost: float, base: float) -> float:
     return (cost - base) / abs(base) if base != 0.0 else float(np.copysign(np.inf, cost - base))
 
 
-def percent(part: float) -> str:
-    """A fraction as text: in percent, or as a multiple where it is large."""
-    if abs(part) >= 1e4:
-        return f"{part:+.1e} x"
-    return f"{100.0 * part:+.2f} %" if abs(part) < 1.0 else f"{100.0 * part:+.0f} %"
-
-
 def verify(
     plan: Solution,
     *,
@@ -202,8 +226,8 @@ def verify(
             substeps=parts,
             accuracy=accuracy,
             integrator=str(integrator),
-            constraints=tuple(closed.outside),
-            open_loop_constraints=tuple(opened.outside),
+            constraints=closed.reports,
+            open_loop_constraints=opened.reports,
         )
         if found.told or not problem.scene.dissipates:
             break
@@ -227,45 +251,14 @@ def played(
     """The motion of a problem under commands on ``fine``, the same :meth:`in_parts`."""
     motion, failure = rollout(fine.scene, integrator, fine.q0, fine.v0, commands, fine.dt)
     if failure is not None:
-        return Played(np.nan, reports_on(fine, None, problem), np.full((1, fine.q0.size), np.nan))
-    cost = float(fine.costs(motion.q, motion.v, fine.control_rows(motion)))
-    return Played(cost, reports_on(fine, motion, problem), motion.q[:: fine.steps // problem.steps])
-
-
-def reports_on(
-    fine: OptimalControlProblem, motion: Trajectory | None, problem: OptimalControlProblem
-) -> list[ConstraintReport]:
-    """How well a motion on ``fine``, the problem :meth:`in_parts`, satisfies each constraint, without margins.
-
-    All NaN without a motion.
-    """
-    found = []
-    for whole, bound in zip(problem.bound_constraints, fine.bound_constraints, strict=True):
-        c = np.full(bound.shape, np.nan)
-        if motion is not None:
-            c = bound.value(motion.q, motion.v, fine.control_rows(motion)).copy()
-        outside = at_start(problem, whole)
-        if outside is not None:
-            # A row that is violated at the start cannot hold before the first node.
-            early = c[: fine.steps // problem.steps - 1]
-            np.minimum(early, 0.0, out=early, where=outside > 0.0)
-        found.append(report_of(problem, bound, c))
-    return found
+        return Played(problem, fine, None, np.nan)
+    return Played(problem, fine, motion, float(fine.costs(motion.q, motion.v, fine.control_rows(motion))))
 
 
 def report_of(problem: OptimalControlProblem, bound: BoundConstraint, c: Floats) -> ConstraintReport:
     """The report of a constraint with values c (K, rows), without multipliers."""
     given = problem.label_of(bound.source), bound.rows, bound.unit, bound.times
     return ConstraintReport(*given, c, np.zeros_like(c), bound.source.equality)
-
-
-def at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats | None:
-    """Rows of a state inequality at the fixed start; None for other constraints."""
-    if bound.of_controls or bound.source.equality:
-        return None
-    q, v = (np.tile(state, (problem.steps + 1, 1)) for state in (problem.q0, problem.v0))
-    c: Floats = bound.value(q, v, np.zeros((problem.steps, problem.scene.controls)))[0]
-    return c
 
 
 def in_parts(plan: Solution, integrator: Integrator, parts: int) -> tuple[Commands, Commands]:

@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError
-from varpin.model.kinematics import FrameKinematics, frame_kinematics
-from varpin.model.meshes import joined, read_mesh, shape_points
+from varpin.model.meshes import MeshPart, joined, read_mesh, shape_points
 from varpin.model.robot import Robot, readable_geometry
 from varpin.model.tree import frame_of, z_to
 from varpin.model.urdf import read_xml
@@ -36,36 +35,21 @@ from varpin.support.frozen import Frozen
 
 coal = pin.coal
 
-# A hull whose least thickness is below this share of its greatest extent is flat.
-_FLAT = 1e-9
 # coal counts the edges that meet in a vertex with 8 bits.
 _EDGES = 254
 # coal's tolerance; its own of 1e-6 leaves errors of 4e-7 m in distances to some hulls, and of 1e-3 in their direction.
 _TOLERANCE = 1e-10
 
 
-@dataclass(frozen=True, eq=False)
-class Hull(Frozen):
-    """A convex polyhedron. Made by :func:`hull_around`."""
-
-    points: Floats  # its vertices (P, 3) [m]
-    faces: NDArray[np.int64]  # indices of the vertices of its triangles (F, 3), anticlockwise from outside
-
-
-def hull_around(name: str, points: ArrayLike) -> Hull:
+def hull_around(name: str, points: ArrayLike) -> MeshPart:
     """The convex hull of points (N, 3) [m], N >= 4."""
     given = as_floats(name, points)
     if given.ndim != 2 or given.shape[1] != 3 or len(given) < 4:
         raise InputError(f"{name} must have shape (N, 3) with N >= 4, got {given.shape}")
-    require_finite(name, given)
-    extents = np.linalg.svd(given - given.mean(axis=0), compute_uv=False)
-    flat = InputError(f"{name} lie in a plane, and a hull needs a volume: give points on both sides of it")
-    if extents[2] <= _FLAT * extents[0]:
-        raise flat
     try:
-        found = scipy.spatial.ConvexHull(given)
+        found = scipy.spatial.ConvexHull(require_finite(name, given))
     except scipy.spatial.QhullError:
-        raise flat from None
+        raise InputError(f"{name} lie in a plane, and a hull needs a volume: give points on both sides of it") from None
     place = np.full(len(given), -1)
     place[found.vertices] = np.arange(len(found.vertices))
     corners, faces = given[found.vertices], place[found.simplices]
@@ -75,7 +59,7 @@ def hull_around(name: str, points: ArrayLike) -> Hull:
     most = int(np.bincount(faces.ravel()).max())
     if most > _EDGES:
         raise InputError(f"{name} have a hull with {most} edges at one vertex, more than {_EDGES}: give fewer points")
-    return Hull(corners, faces)
+    return MeshPart(corners, faces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +120,7 @@ class Obstacle(Frozen):
         """
         at = finite_array(f"{name} position", position, (3,))
         R = np.eye(3) if rotation is None else rotation_matrix(f"{name} rotation", rotation)
-        return cls(str(name), hull_around(f"{name} points", points).points, 0.0, at, R)
+        return cls(str(name), hull_around(f"{name} points", points).vertices, 0.0, at, R)
 
     @classmethod
     def mesh(
@@ -159,26 +143,18 @@ class Obstacle(Frozen):
         return cls.convex(points, position, rotation, Path(path).stem if name is None else name)
 
     @property
-    def shape(self) -> Any:
-        """The body for coal."""
-        length = float(np.linalg.norm(self.points[-1] - self.points[0]))
-        if len(self.points) <= 2:
-            return coal.Capsule(self.radius, length) if length > 0.0 else coal.Sphere(self.radius)
-        hull = hull_around(self.name, self.points)
-        points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
-        points.extend(hull.points)
-        triangles.extend(coal.Triangle(*map(int, face)) for face in hull.faces)
-        return coal.Convex(points, triangles)
-
-    @property
-    def placement(self) -> pin.SE3:
-        """Placement of :attr:`shape`, whose z axis is that of a capsule, before the obstacle moves."""
+    def body(self) -> tuple[Any, pin.SE3]:
+        """The body for coal, and its placement before the obstacle moves."""
         if len(self.points) > 2:
-            return pin.SE3(self.rotation, self.position)
+            hull, points, triangles = hull_around(self.name, self.points), coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+            points.extend(hull.vertices)
+            triangles.extend(coal.Triangle(*map(int, face)) for face in hull.faces)
+            return coal.Convex(points, triangles), pin.SE3(self.rotation, self.position)
         way = self.points[-1] - self.points[0]
         length = float(np.linalg.norm(way))
-        middle = 0.5 * (self.points[0] + self.points[-1])
-        return pin.SE3(z_to(way / length) if length > 0.0 else self.rotation, self.position + middle)
+        # A capsule is along its z axis.
+        axes = z_to(way / length) if length > 0.0 else self.rotation
+        return coal.Capsule(self.radius, length), pin.SE3(axes, self.position + self.points.mean(axis=0))
 
     def moving(self, shift: Callable[[float], ArrayLike]) -> Obstacle:
         """The obstacle displaced by ``shift(t)`` (3,) [m] from its described position at each time t [s].
@@ -230,10 +206,10 @@ class Clearance(Frozen):
         return tuple(f"{bodies[i].name} and {bodies[k].name}" for i, k in self.pairs)
 
     @property
-    def capsules(self) -> dict[str, tuple[Floats, Floats, float]]:
+    def capsules(self) -> dict[str, tuple[list[float], list[float], float]]:
         """Ends and radius of the capsules of the links that joints move, by name."""
         moving = (link for link in self.links if _joint(self.robot, link.name))
-        return {link.name: (link.points[0], link.points[1], link.radius) for link in moving}
+        return {link.name: (*link.points.tolist(), link.radius) for link in moving}
 
     def over(self, times: Floats) -> Clearance:
         """The same with the obstacles at times (K,) [s].
@@ -243,36 +219,37 @@ class Clearance(Frozen):
         """
         bodies = enumerate(self.obstacles, len(self.links))
         shifts = {i: body.shifts(times) for i, body in bodies if body.shift is not None}
-        # The bodies and frames stay.
-        return self.changed(shifts=shifts, _shapes=self._shapes, _frames=self._frames) if shifts else self
+        # The bodies stay.
+        return self.changed(shifts=shifts, _shapes=self._shapes, _moved=self._moved) if shifts else self
 
     def distances(self, q: Floats) -> Floats:
         """The distance of each pair (N, pairs) [m] at q (N, n); negative where they overlap."""
-        found = [[result.min_distance for result in results] for results in self._results(q)]
+        found = [[own.min_distance for own in results] for results, _ in self._results(q)]
         return np.array(found).reshape(len(q), len(self.pairs))
 
     def slopes(self, q: Floats) -> Floats:
         """Derivatives of the distances in q (N, pairs, n), from the nearest points of each pair."""
-        points, normals = np.empty((2, len(q), len(self.pairs), 3))
-        for row, results in enumerate(self._results(q)):
-            for p, result in enumerate(results):
-                points[row, p], normals[row, p] = result.getNearestPoint1(), result.normal
-        found = np.zeros((*points.shape[:2], q.shape[1]))
-        jacobians = {i: frame.jacobians(q) for i, frame in self._frames.items()}
-        for p, pair in enumerate(self.pairs):
-            for i, along in zip(pair, (-normals[:, p], normals[:, p]), strict=True):
-                if i in jacobians:
-                    _, origin, J = jacobians[i]
-                    # The nearest point of the second body is on the same line.
-                    lever = np.cross(points[:, p] - origin, along)
-                    found[:, p] += np.einsum("Na,Nan->Nn", along, J[:, :3]) + np.einsum("Na,Nan->Nn", lever, J[:, 3:])
+        model, n = self.robot.model, q.shape[1]
+        (points, normals), J = np.empty((2, len(q), len(self.pairs), 3)), np.empty((len(q), 6, model.nv))
+        for row, (results, data) in enumerate(self._results(q)):
+            points[row] = [own.getNearestPoint1() for own in results]
+            normals[row] = [own.normal for own in results]
+            # Of what is at the world's origin.
+            J[row] = pin.computeJointJacobians(model, data).reshape(6, -1)
+        # The nearest point of the second body is on the same line.
+        along = np.concatenate([normals, np.cross(points, normals)], axis=2) @ J
+        first, second = np.array(self.pairs).T
+        found: Floats = along * (self._moved[second] - self._moved[first]) @ self.robot.velocity(np.eye(n)).T
         return found
 
     @cached_property
-    def _frames(self) -> dict[int, FrameKinematics]:
-        """The frames of the links that joints move."""
-        moving = ((i, link.name) for i, link in enumerate(self.links) if _joint(self.robot, link.name))
-        return {i: frame_kinematics(self.robot, name) for i, name in moving}
+    def _moved(self) -> Floats:
+        """1 where a joint of the robot's model moves a body, else 0 (bodies, joints)."""
+        model = self.robot.model
+        found = np.zeros((len(self.links) + len(self.obstacles), model.njoints))
+        for i, link in enumerate(self.links):
+            found[i, list(model.supports[_joint(self.robot, link.name)])] = 1.0
+        return found[:, 1:]
 
     @cached_property
     def _shapes(self) -> pin.GeometryModel:
@@ -280,26 +257,28 @@ class Clearance(Frozen):
         model, shapes = self.robot.model, pin.GeometryModel()
         frames = [frame_of(model, link.name, self.robot.name) for link in self.links]
         frames += [model.frames[0]] * len(self.obstacles)
-        for i, (body, frame) in enumerate(zip((*self.links, *self.obstacles), frames, strict=True)):
-            place = frame.placement * body.placement
-            shapes.addGeometryObject(pin.GeometryObject(str(i), frame.parentJoint, place, body.shape))
+        for i, (own, frame) in enumerate(zip((*self.links, *self.obstacles), frames, strict=True)):
+            shape, place = own.body
+            shapes.addGeometryObject(pin.GeometryObject(str(i), frame.parentJoint, frame.placement * place, shape))
         for pair in self.pairs:
             shapes.addCollisionPair(pin.CollisionPair(*pair))
         return shapes
 
-    def _results(self, q: Floats) -> Iterator[Any]:
-        """What coal finds of each pair, for each row of q; valid until the next row."""
+    def _results(self, q: Floats) -> Iterator[tuple[list[Any], pin.Data]]:
+        """What coal finds of each pair, and where joints are, for each row of q; valid until the next row."""
         model, shapes, request = self.robot.model, self._shapes, coal.DistanceRequest()
         request.gjk_tolerance = request.epa_tolerance = _TOLERANCE
         data, at = model.createData(), shapes.createData()
         for p in range(len(self.pairs)):
             at.distanceRequests[p] = request
+        # Python takes longer to find the results than coal does.
+        results = list(at.distanceResults)
         for row, configuration in enumerate(self.robot.configuration(q)):
             pin.updateGeometryPlacements(model, data, shapes, at, configuration)
             for i, shifts in self.shifts.items():
                 at.oMg[i].translation = at.oMg[i].translation + shifts[row % len(shifts)]
             pin.computeDistances(shapes, at)
-            yield at.distanceResults
+            yield results, data
 
 
 def _joint(robot: Robot, frame: str) -> int:

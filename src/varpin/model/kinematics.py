@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pinocchio as pin
 
 from varpin.arrays import Floats
 from varpin.core import Links as Core
@@ -89,6 +90,11 @@ def frame_kinematics(robot: Robot, frame: str) -> FrameKinematics:
     if body < 0:
         raise InputError(f"frame {frame!r} of robot {robot.name!r} is fixed to the base: no joint moves it")
     return FrameKinematics(frame, links(robot.tree, body), rotation, translation)
+
+
+def logarithms(R: Floats) -> tuple[Floats, Floats]:
+    """Rotation vectors (N, 3) of rotations (N, 3, 3), and derivatives (N, 3, 3) over turns of the rotated body."""
+    return np.array([pin.log3(turn) for turn in R]), np.array([pin.Jlog3(turn) for turn in R])
 
 
 def mass_carriers(robot: Robot) -> Links:

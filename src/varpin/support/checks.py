@@ -116,15 +116,17 @@ def control_array(
 
 
 def control_values(
-    name: str, value: JointValues, joints: Sequence[str] | None, size: int, *, uniform: bool = False
+    name: str, value: JointValues, joints: Sequence[str] | None, m: int, *, uniform: bool = False, absent: float = 0.0
 ) -> Floats:
     """``value``, (m,) or by joint name, as a new float array (m,); errors as :func:`control_array`.
 
-    With ``uniform`` it may be one number for all controls.
+    With ``uniform`` it may be one number for all controls, and need not be finite where ``absent`` is not.
     """
     if isinstance(value, Mapping):
-        return control_array(name, value, joints)
-    return broadcast_array(name, value, size) if uniform else finite_array(name, value, (size,))
+        return control_array(name, value, joints, absent=absent)
+    if uniform:
+        return broadcast_array(name, value, m, limit=not math.isfinite(absent))
+    return finite_array(name, value, (m,))
 
 
 def named_limits(
@@ -139,10 +141,7 @@ def named_limits(
     both = np.empty((2, size))
     for row, side, value, none in zip(both, ("lower", "upper"), pair, (-np.inf, np.inf), strict=True):
         what = f"{name}: {side}"
-        if isinstance(value, Mapping):
-            row[:] = control_array(what, value, joints, absent=none)
-        else:
-            row[:] = broadcast_array(what, value, size, limit=True)
+        row[:] = control_values(what, value, joints, size, uniform=True, absent=none)
         if np.isnan(row).any():
             raise InputError(f"{what}[{int(np.argmax(np.isnan(row)))}] is NaN; inf stands for no limit")
     wrong = ~(both[0] <= both[1]) | (both[0] == np.inf) | (both[1] == -np.inf)

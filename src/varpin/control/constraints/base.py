@@ -29,7 +29,7 @@ class Horizon(Frozen):
     """The time grid of a plan, to which constraints are bound.
 
     Attributes:
-        t: Times of the nodes (N + 1,) [s].
+        t: Times of the nodes (N + 1,) [s], or of any states.
         robot: The problem's robot.
         controls: m.
         hold: Steps that share one control.
@@ -55,6 +55,9 @@ class Horizon(Frozen):
 @dataclass(frozen=True, eq=False)
 class BoundConstraint(Frozen, ABC):
     """A constraint on a grid: c <= 0 or c = 0 for ``rows`` at each of K places, nodes or decisions.
+
+    Where it is one of states, c at a place depends on the state there and on the time alone. An inequality at all
+    nodes but the first then has values between nodes, too: other ``places`` are rows of states at other times.
 
     Attributes:
         source: The constraint.
@@ -90,6 +93,10 @@ class BoundConstraint(Frozen, ABC):
         Where controls are linear between nodes, u (..., N + 1, m) are those at the nodes.
         """
 
+    def of_states(self, q: Floats, v: Floats) -> Floats:
+        """:meth:`value` of a constraint of states, in which controls have no part."""
+        return self.value(q, v, np.zeros((*q.shape[:-1], 0)))
+
     def jacobian(self, q: Floats, v: Floats) -> Floats:
         """dc/d(q, v) (K, rows, 2n) of one motion, q and v (N + 1, n).
 
@@ -100,7 +107,7 @@ class BoundConstraint(Frozen, ABC):
 
 
 class PlanConstraint(Frozen, ABC):
-    """A hard constraint of a plan. A subclass implements ``bind``.
+    """A hard constraint of a plan. A subclass implements ``bind``, for any horizon.
 
     Constraints raise an InputError for arguments of a wrong shape or value, such as a frame that is fixed to the base,
     and an UnknownJoint or UnknownFrame for a name that the robot does not have.
@@ -174,11 +181,6 @@ class OfStates(PlanConstraint):
     def slopes(self, q: Floats, v: Floats) -> Floats:
         """dc/dq (P, rows, n) or dc/d(q, v) (P, rows, 2n)."""
 
-    def jacobian(self, q: Floats, v: Floats) -> Floats:
-        """dc/d(q, v) (P, rows, 2n) at states q and v (P, n)."""
-        found = self.slopes(q, v)
-        return np.pad(found, ((0, 0), (0, 0), (0, 2 * q.shape[1] - found.shape[2])))
-
 
 @dataclass(frozen=True, eq=False)
 class BoundStates(BoundConstraint):
@@ -195,7 +197,8 @@ class BoundStates(BoundConstraint):
         return self.of.values(*at).reshape(*q.shape[:-2], *self.shape)
 
     def jacobian(self, q: Floats, v: Floats) -> Floats:
-        return self.of.jacobian(q[self.places], v[self.places])
+        found = self.of.slopes(q[self.places], v[self.places])
+        return np.pad(found, ((0, 0), (0, 0), (0, 2 * q.shape[1] - found.shape[2])))
 
 
 def finite_sides(limits: Floats) -> tuple[Integers, Floats, Floats, list[str]]:

@@ -70,9 +70,7 @@ class KeepClear(OfStates):
             raise InputError("KeepClear srdf leaves out pairs of links, and there are none without itself=True")
         self._of = clearance(robot, self.obstacles, links=names, itself=itself, srdf=file, capsules=capsules)
         self.pairs = self._rows = self._of.names
-        self.capsules = {
-            name: (begin.tolist(), end.tolist(), radius) for name, (begin, end, radius) in self._of.capsules.items()
-        }
+        self.capsules = self._of.capsules
 
     def at(self, times: Floats) -> Self:
         return self.changed(_of=self._of.over(times))

@@ -7,19 +7,16 @@ from collections.abc import Callable
 from typing import Self
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.control.constraints.base import OfStates, finite_sides
 from varpin.errors import InputError
 from varpin.model import Robot
-from varpin.model.kinematics import frame_kinematics
+from varpin.model.kinematics import frame_kinematics, logarithms
 from varpin.support.checks import finite, finite_array, named_limits, over_time, positive, rotation_matrix
 
 _XYZ = ("x", "y", "z")
-# Angle [rad] below which a series replaces the formula, which cancels there; from 1e-4 to 1e-2.
-_SMALL = 1e-3
 
 
 class _OfFrame(OfStates):
@@ -68,32 +65,16 @@ class ReachFrame(_OfFrame):
     def values(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
         R, p = self.kinematics.placements(q)
         found = [] if self.position is None else [p - self.position]
-        found += [] if self.rotation is None else [_turns(self.rotation.T @ R)]
+        found += [] if self.rotation is None else [logarithms(self.rotation.T @ R)[0]]
         return np.concatenate(found, axis=1)
 
     def slopes(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
         R, _, J = self.kinematics.jacobians(q)
         found = [] if self.position is None else [J[:, :3]]
         if self.rotation is not None:
-            of_body = np.array([_log_slope(turn) for turn in _turns(self.rotation.T @ R)]) @ np.swapaxes(R, 1, 2)
+            of_body = logarithms(self.rotation.T @ R)[1] @ np.swapaxes(R, 1, 2)
             found.append(of_body @ J[:, 3:])
         return np.concatenate(found, axis=1)
-
-
-def _turns(R: Floats) -> Floats:
-    """The rotation vectors (N, 3) of rotations (N, 3, 3)."""
-    turns: Floats = scipy.spatial.transform.Rotation.from_matrix(R).as_rotvec()
-    return turns
-
-
-def _log_slope(e: Floats) -> Floats:
-    """The inverse of SO(3)'s right Jacobian at the rotation vector e (3,): d log(R) over the body's rotation."""
-    angle = float(np.linalg.norm(e))
-    E = np.array([[0.0, -e[2], e[1]], [e[2], 0.0, -e[0]], [-e[1], e[0], 0.0]])
-    near = angle < _SMALL
-    part = 1.0 / 12.0 + angle**2 / 720.0 if near else 1.0 / angle**2 - 0.5 / (angle * np.tan(0.5 * angle))
-    slope: Floats = np.eye(3) + 0.5 * E + part * E @ E
-    return slope
 
 
 class _Region(_OfFrame):

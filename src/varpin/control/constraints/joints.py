@@ -11,15 +11,7 @@ from varpin.arrays import Floats, Integers
 from varpin.control.constraints.base import LENGTH, BoundConstraint, Horizon, OfStates, PlanConstraint, finite_sides
 from varpin.errors import InputError
 from varpin.model import Robot, joint_unit
-from varpin.support.checks import (
-    JointValues,
-    as_floats,
-    broadcast_array,
-    control_array,
-    control_values,
-    real,
-    some_limits,
-)
+from varpin.support.checks import JointValues, as_floats, control_values, real, some_limits
 
 
 class _WithinLimits(OfStates):
@@ -138,10 +130,7 @@ class WithinControlRate(PlanConstraint):
 
     def bind(self, horizon: Horizon) -> BoundConstraint:
         name, m, joints = "WithinControlRate", horizon.controls, horizon.control_joints
-        if isinstance(self.limit, Mapping):
-            limit = control_array(f"{name} limit", self.limit, joints, absent=np.inf)
-        else:
-            limit = broadcast_array(f"{name} limit", self.limit, m, limit=True)
+        limit = control_values(f"{name} limit", self.limit, joints, m, uniform=True, absent=np.inf)
         if not np.isfinite(limit).any():
             raise InputError(f"{name} limit must be finite for some control")
         before = horizon.before

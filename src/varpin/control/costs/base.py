@@ -359,6 +359,18 @@ def weight_matrix(name: str, weight: Floats, size: int) -> Floats:
     return weight * np.eye(size) if weight.ndim < 2 else weight
 
 
+def checked_reference(name: str, reference: ReferenceValues, *, turns: bool = False) -> ReferenceValues:
+    """A reference as given, a function or an array; one of ``turns`` (..., 3, 3) holds rotation matrices.
+
+    Raises:
+        InputError: The array is not finite, or a matrix is no rotation.
+    """
+    if callable(reference):
+        return reference
+    array = require_finite(f"{name} reference", as_floats(f"{name} reference", reference))
+    return _rotations(name, array) if turns and array.shape[-2:] == (3, 3) else array
+
+
 def sample(
     name: str, reference: ReferenceValues, points: Points, shape: tuple[int, ...], *, held: bool = False
 ) -> Floats:
@@ -374,13 +386,13 @@ def sample(
     if callable(reference):
         try:
             given = [(partial(reference, t), shape, f" at t = {t:.6g} s") for t in points.t.tolist()]
-            return _rotations(name, np.array([returned("the reference", *each) for each in given]))
+            found = np.array([returned("the reference", *each) for each in given])
+            return _rotations(name, found) if len(shape) == 2 else found
         except InputError as error:
             raise CostError(name, str(error)) from error
-    array = require_finite(f"{name} reference", as_floats(f"{name} reference", reference))
-    steps, N = points.steps, points.steps + 1
+    array, steps, N = np.asarray(reference), points.steps, points.steps + 1
     if array.shape in ((), shape):
-        return _rotations(name, np.array(np.broadcast_to(array, (1, *shape))))
+        return np.full((1, *shape), array)
     if held and array.shape == (steps, *shape):
         step = np.floor(points.elapsed * (steps / points.duration) + TRACE).astype(np.int64)
         held_rows: Floats = array[np.minimum(step, steps - 1)]
@@ -393,14 +405,14 @@ def sample(
         )
     nodes = np.linspace(0.0, points.duration, N)
     if len(shape) == 2:
-        rotations = scipy.spatial.transform.Rotation.from_matrix(_rotations(name, array))
+        rotations = scipy.spatial.transform.Rotation.from_matrix(array)
         turns = scipy.spatial.transform.Slerp(nodes, rotations)
         return np.asarray(turns(np.clip(points.elapsed, 0.0, points.duration)).as_matrix())
     return np.column_stack([np.interp(points.elapsed, nodes, column) for column in array.T])
 
 
 def _rotations(name: str, values: Floats) -> Floats:
-    """Values of a reference; an InputError where they are matrices (N, 3, 3), and one is no rotation."""
-    for k, R in enumerate(values if values.ndim == 3 else ()):
-        rotation_matrix(f"{name} reference{f' number {k}' if len(values) > 1 else ''}", R)
+    """Values of a reference (..., 3, 3); an InputError where one is no rotation."""
+    for k, R in enumerate(matrices := values.reshape(-1, 3, 3)):
+        rotation_matrix(f"{name} reference{f' number {k}' if len(matrices) > 1 else ''}", R)
     return values

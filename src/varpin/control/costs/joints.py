@@ -16,6 +16,7 @@ from varpin.control.costs.base import (
     LeastSquares,
     Points,
     ReferenceValues,
+    checked_reference,
     checked_weight,
     plain,
     sample,
@@ -38,8 +39,7 @@ class _Quadratic(LeastSquares):
     def __init__(self, reference: ReferenceValues | Mapping[str, float], weight: JointValues) -> None:
         name = type(self).__name__
         self.weight = weight if isinstance(weight, Mapping) else checked_weight(name, weight)
-        given = isinstance(reference, Mapping) or callable(reference)
-        self.reference = reference if given else as_floats(f"{name} reference", reference)
+        self.reference = reference if isinstance(reference, Mapping) else checked_reference(name, reference)
 
     def bind(self, points: Points) -> BoundCost:
         name, of_controls = type(self).__name__, self._block == 2

@@ -13,6 +13,7 @@ from varpin.control.costs.base import (
     LeastSquares,
     Points,
     ReferenceValues,
+    checked_reference,
     checked_weight,
     sample,
     weight_matrix,
@@ -21,7 +22,7 @@ from varpin.core import Subject
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
 from varpin.model.kinematics import frame_kinematics, mass_carriers, require_same
-from varpin.support.checks import as_floats, positive, tuple_of
+from varpin.support.checks import positive, tuple_of
 
 
 class _TaskCost(LeastSquares):
@@ -50,7 +51,7 @@ class _TaskCost(LeastSquares):
         self._of = mass_carriers(robot) if self._of_all else frame_kinematics(robot, frame)
         self.weight = checked_weight(name, weight)
         weight_matrix(name, self.weight, self.shape[0])
-        self.target = target if callable(target) else as_floats(f"{name} reference", target)
+        self.target = checked_reference(name, target, turns=self.shape == (3, 3))
 
     def bind(self, points: Points) -> BoundTerm:
         name = type(self).__name__

@@ -20,7 +20,6 @@ from numpy.typing import ArrayLike, NDArray
 from pinocchio.visualize.meshcat_visualizer import MeshcatVisualizer
 
 from varpin.arrays import Floats
-from varpin.model.clearance import Hull
 from varpin.model.meshes import MeshPart, joined
 from varpin.model.tree import z_to
 from varpin.show.replay.picture import Shape
@@ -194,9 +193,9 @@ def sheet(half: float, color: int) -> Object:
     return Mesh(form, LOOKS["sheet"](color=color))
 
 
-def solid(form: Hull, color: int) -> Object:
+def solid(form: MeshPart, color: int) -> Object:
     """A translucent convex hull."""
-    return Mesh(TriangularMeshGeometry(form.points, form.faces), LOOKS["solid"](color=color))
+    return Mesh(TriangularMeshGeometry(form.vertices, form.faces), LOOKS["solid"](color=color))
 
 
 def triad(length: float) -> Object:
