@@ -202,10 +202,10 @@ def repeated(
             scene,
             state,
             block,
-            np.ascontiguousarray(drawn[:, taken]) if len(drawn) else drawn,
+            drawn[:, taken],
             trajectory.dt / parts,
-            drift=None if drift is None else np.ascontiguousarray(drift[:, taken]),
-            impulses=None if kicks is None else np.ascontiguousarray(kicks[:, taken]),
+            drift=None if drift is None else drift[:, taken],
+            impulses=None if kicks is None else kicks[:, taken],
         )
         new = len(last.q) // parts
         for nodes, values in ((q, last.q), (v, last.v)):

@@ -250,7 +250,7 @@ class PathDriver {
         const int n = mechanism.dof(), m = mechanism.controls;
         const std::int64_t width = increments_of_step(mechanism, commands);
         const bool sloped = commands.sloped || !more.increments;
-        const bool noisy = more.increments || mechanism.diffusion.by_velocity;
+        const bool noisy = more.increments || (mechanism.diffusion.by_velocity && !more.drift);
         for (std::int64_t path = 0; path < nodes.paths; ++path) {
             double* u = nodes.u + path * nodes.steps * m;
             auto [outcome, first, second] = begin(path);
