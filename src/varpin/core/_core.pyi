@@ -31,7 +31,11 @@ class Mechanism:
         diffusion: Diffusion,
         noise: tuple[Callable[..., tuple[Floats, Floats]], Integers, bool] | None = None,
     ) -> Mechanism:
-        """Raises ValueError for arrays that do not fit each other or describe no tree."""
+        """Raises ValueError for arrays that do not fit each other or describe no tree.
+
+        ``noise`` is a :class:`varpin.mechanics.noise.StepNoise`, the processes that see the slope of a control within
+        a step, and whether a field depends on the velocity.
+        """
 
     def jet(self, q: Floats, v: Floats) -> tuple[float, Floats, Floats, Floats, Floats, Floats]:
         """L, L_q, L_v, L_qq, L_vq and L_vv at q, v (n,)."""
