@@ -53,13 +53,13 @@ def empty(given, hold):
 
 def run_over(given, end_gradient, end_hessian, *, roots, hold=1, regularization=0.0, h=H):
     """(-1 or the decision without a minimum, what the pass filled in, the pass)."""
-    m, gains, more = given["B"].shape[2], empty(given, hold), {}
+    m, gains = given["B"].shape[2], empty(given, hold)
     if roots:
         run = RootPass(m, squares_of(end_gradient[None], end_hessian[None]), end_gradient)
-        more["running"] = squares_of(given["gradient"], given["hessian"])
+        given = given | {"hessian": squares_of(given["gradient"], given["hessian"])}
     else:
         run = core.BackwardPass(m, end_gradient, end_hessian)
-    return run.run(h, hold, regularization, **given, **gains, **more), gains, run
+    return run.run(h, hold, regularization, **given, **gains), gains, run
 
 
 def plainly(given, hold, regularization, end_gradient, end_hessian):

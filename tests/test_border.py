@@ -42,7 +42,7 @@ def record(kind, prefix, parts):
 def of_mechanism(scene):
     return {
         **fields_of("tree", scene.robot.tree),
-        **fields_of("diffusion", scene.diffusion),
+        **fields_of("diffusion", scene.noise.arrays),
         **{name: getattr(scene, name) for name in ("gravity", "actuation")},
         "forces": scene.elements,
         "couplings": scene.couplings,
@@ -96,12 +96,9 @@ def variational(scene):
     return core.Rollout(scene.core, tableau, 0.5, guards, 0.5, P)
 
 
-def constrained(scene, *, begun=False):
+def constrained(scene):
     tableau, guards = core.Tableau.make(**of_tableau()), core.Guards.make(**GUARDS)
-    rollout = core.Rollout(scene.core, tableau, 0.5, guards, 1.0, P, places=lobatto_places(2))
-    n = scene.robot.dof
-    assert not begun or rollout.begin(draw(P, n), draw(P, n))
-    return rollout
+    return core.Rollout(scene.core, tableau, 0.5, guards, 1.0, P, places=lobatto_places(2))
 
 
 def explicit(scene, method):
@@ -172,7 +169,8 @@ def calls():
     yield "jets along", own.core.jets_along, {**states, "alpha": draw(N, n), "beta": draw(N, n)}
     yield "tableau", core.Tableau.make, of_tableau()
     yield "begin", variational(own).begin, {"q": draw(P, n), "v": draw(P, n)}
-    yield "kick", begun(own).kick, {"impulse": draw(P, n)}
+    nodes = fields_of("nodes", new_nodes(P, 1, n, m))
+    yield "first nodes", lambda **parts: begun(own).first_nodes(record(RolloutArrays, "nodes", parts)), nodes
     for feedback in ("none", "state", "state and control"):
         yield f"roll, feedback of {feedback}", roll(begun(own)), of_roll(own, feedback)
         for method in core.ExplicitMethod:
@@ -189,7 +187,6 @@ def calls():
     at = {"q": draw(n), "weights": draw(3), "v": draw(n)}
     yield "curvature of constraints", closed.core.constraint_curvature, at
     yield "begin under constraints", constrained(closed).begin, {"q": draw(P, n), "v": draw(P, n)}
-    yield "kick under constraints", constrained(closed, begun=True).kick, {"impulse": draw(P, n)}
     moved = vp.Scene(own.robot, constraints=vp.KinematicInput(own.robot.joint_names[0], "cubic"))
     again = {"rates": draw(N, 1), "places": lobatto_places(2)}
     yield "derivatives under constraints", core.Steps(**steps(moved)).derivatives, again
@@ -283,14 +280,15 @@ def test_two_threads_in_forks_of_one_rollout_are_refused():
     assert rollout.begin(np.zeros((1, 3)), np.zeros((1, 3)))
     other, nodes = rollout.fork(core.Guards.make(**GUARDS)), new_nodes(1, 50_000, 3, 3)
     nothing = np.zeros((0, 0, 0)), np.zeros((0, 0, 3))
+    one = 1e-3, open_loop(np.zeros((1, 3))), *nothing, new_nodes(1, 1, 3, 3)
     thread = threading.Thread(target=rollout.roll, args=(1e-3, open_loop(np.zeros((50_000, 3))), *nothing, nodes))
     thread.start()
     with refused(RuntimeError, "two threads"):
         while thread.is_alive():
-            other.kick(np.zeros((1, 3)))
+            other.roll(*one)
     thread.join()
     assert nodes.done == 50_000
-    other.kick(np.zeros((1, 3)))
+    other.roll(*one)
 
 
 @pytest.mark.parametrize(

@@ -471,14 +471,14 @@ def deadly(q, v):
 def test_paths_that_were_finished_before_a_worker_was_lost_are_kept():
     scene, q0 = vp.Scene(vp.planar_chain(1), forces=[vp.CustomForce(deadly)]), np.linspace(-1.0, 0.0, 300)[:, None]
     q0[-1], options = 2.1, {"dt": 0.01, "steps": 20, "integrator": vp.ExplicitEuler()}
-    with ProcessPoolExecutor(1) as pool, refused(vp.WorkersLost, "lost", ".ensemble") as caught:
+    with ProcessPoolExecutor(1) as pool, refused(vp.WorkersLost, "lost", ".result") as caught:
         vp.simulate_ensemble(scene, q0, [0.0], paths=300, rng=0, executor=pool, **options)
     assert isinstance(caught.value.__cause__, BrokenProcessPool)
-    kept = caught.value.ensemble
+    kept = caught.value.result
     assert 100 < len(kept.q) < 300
     motion = vp.simulate(scene, q0[7], [0.0], check=False, **options)
     assert kept.q[7].tobytes() == motion.q.tobytes()
-    assert pickle.loads(pickle.dumps(caught.value)).ensemble.q.shape == kept.q.shape
+    assert pickle.loads(pickle.dumps(caught.value)).result.q.shape == kept.q.shape
 
 
 def test_workers_or_executor(spawned):

@@ -415,19 +415,20 @@ class TestWhereItFails:
             vp.simulate(own, Q0, V0, dt=0.01, steps=50, integrator=vp.Gauss(2), check=False)
 
 
-@pytest.mark.parametrize("kind", ["force", "constraint"])
+@pytest.mark.parametrize("kind", ["forces", "constraints", "noise"])
 def test_a_scene_whose_function_knows_it_is_collected(kind):
     """The core's own reference is none that keeps it alive."""
 
     def made():
         box = []
-        if kind == "force":
-            scene = vp.Scene(ROBOT, forces=vp.CustomForce(lambda q, v: -0.1 * v * len(box)))
-        else:
-            own = vp.CustomConstraint(1, lambda q: [q[0] * len(box)], lambda q: [[1.0, 0.0, 0.0]])
-            scene = vp.Scene(ROBOT, constraints=own)
+        own = {
+            "forces": vp.CustomForce(lambda q, v: -0.1 * v * len(box)),
+            "constraints": vp.CustomConstraint(1, lambda q: [q[0] * len(box)], lambda q: [[1.0, 0.0, 0.0]]),
+            "noise": vp.CustomNoise(lambda q, v, u: np.full((3, 1), 0.1 * len(box)), 1),
+        }
+        scene = vp.Scene(ROBOT, **{kind: own[kind]})
         box.append(scene)
-        vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-2, steps=2)
+        vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-2, steps=2, rng=0)
         return weakref.ref(scene)
 
     gone = made()

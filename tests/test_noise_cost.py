@@ -12,7 +12,7 @@ from plan_problems import linear
 import varpin as vp
 from varpin.control.noise import left_within_steps, noise_cost
 from varpin.control.stages import Feedback, Steps
-from varpin.integrators.base import diffusion_and_drift
+from varpin.mechanics.noise import ito_drift, over_steps
 
 CONTROL, STATE = vp.ControlNoise(0.3), vp.StateNoise(3.0, center=np.zeros(2))
 SLIDING = vp.CustomNoise(
@@ -275,11 +275,12 @@ def test_the_drift_along_a_line_is_its_mean_over_the_step(integrator):
         motion = at.simulate(lines(at, u.reshape(2, 2)))
         return np.concatenate([motion.q[1], motion.p[1] if integrator.variational else motion.v[1]])
 
-    def local(control):
-        return diffusion_and_drift(scene, problem.q0, problem.v0, control, problem.q0)[1]
+    def local(control, ends=None):
+        q, v = problem.q0[None], problem.v0[None]
+        return ito_drift(scene.core, q, v, over_steps(scene.noise, q, v, control[None], ends, problem.q0))[0]
 
     mean = 0.5 * (u[:2] + u[2:])
-    found = diffusion_and_drift(scene, problem.q0, problem.v0, mean, problem.q0, (u[None, :2], u[None, 2:]))[1]
+    found = local(mean, (u[None, :2], u[None, 2:]))
     assert_allclose(found, (local(u[:2]) + 4.0 * local(mean) + local(u[2:])) / 6.0, atol=1e-14)
     assert np.abs(found - local(mean)).max() > 1e-2
     lin = vp.linearize(scene, problem.simulate(lines(problem, u.reshape(2, 2))))

@@ -124,6 +124,10 @@ def test_motions_show_where_they_went(objects):
         q, v = motion.q[:, k], motion.v[:, k]
         numbers = [q[0], q[-1], q.min(), q.max(), np.abs(v).max()]
         assert row(shown, name) == [f"{number:.4g}" for number in numbers]
+    ensemble, end = objects["ensemble"], objects["ensemble"].q[:, -1]
+    for k, name in enumerate(NAMES):
+        numbers = [end[:, k].mean(), end[:, k].std(ddof=1)]
+        assert row(ensemble._repr_html_(), name) == [f"{number:.4g}" for number in numbers]
     lost = np.abs(motion.energy - motion.energy[0]).max()
     assert row(shown, "energy change")[0].endswith(f", {lost:.3g} J at most in between")
     assert "warning" not in Reader(shown).text

@@ -7,6 +7,7 @@ import inspect
 import itertools
 import logging
 import os
+import pickle
 import re
 import tomllib
 from pathlib import Path
@@ -188,6 +189,13 @@ torque_limit = { elbow_joint = 100.0, wrist_1_joint = 20.0, wrist_2_joint = 8.0 
 """
     + HORIZON
 )
+
+
+def test_pickles_are_the_same_scene():
+    file = vp.load_scene("allegro_finger")
+    again = pickle.loads(pickle.dumps(file))
+    assert (repr(again), again._repr_html_()) == (repr(file), file._repr_html_())
+    np.testing.assert_array_equal(again.simulate().q, file.simulate().q)
 
 
 def same_scene(file, **arguments):

@@ -181,13 +181,12 @@ class WorkersLost(VarpinError, RuntimeError):
     """An executor has lost its workers, as when a process of a pool is killed.
 
     Attributes:
-        ensemble: The paths of :func:`varpin.simulate_ensemble` that were finished, in order from the first; None if
-            there are none, and elsewhere.
+        result: What the finished paths give, as :attr:`varpin.PathsInterrupted.result`.
     """
 
-    def __init__(self, cause: object, ensemble: Any = None) -> None:
-        self.ensemble = ensemble
-        kept = "" if ensemble is None else f"; {int(ensemble.statistics.count[0])} finished paths are in .ensemble"
+    def __init__(self, cause: object, result: Any = None) -> None:
+        self.result = result
+        kept = "" if result is None else "; the finished paths are in .result"
         super().__init__(f"the executor has lost its workers{kept}: {cause}")
 
 

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.integrators import Integrator, integrator_of
-from varpin.integrators.base import diffusion_and_drift, noise_fields
+from varpin.integrators.base import noise_fields
 from varpin.integrators.registry import require_motion, require_scene_of
-from varpin.mechanics.noise import Fields
+from varpin.mechanics.noise import Fields, ito_drift, over_steps
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.signals.commands import open_line, open_loop
 from varpin.simulation.choice import given_integrator
@@ -148,7 +148,7 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     found = linearize_steps(scene, trajectory, integrator, trajectory.q[0], ramps=within)
     if not integrator.variational:
         # From a jump of the velocity to one of the momentum.
-        M, _ = node_jets(scene, trajectory.q[:-1], trajectory.v[:-1])
+        M, _ = scene.core.jets(trajectory.q[:-1], trajectory.v[:-1])
         found = replace(found, K=found.J @ np.linalg.inv(M))
     return replace(found, warnings=wrong_spread(scene, integrator, trajectory), constrained=bool(scene.constraints))
 
@@ -186,7 +186,7 @@ def linearize_steps(
         to_state = None
         jump, jump_x = start.F, _in_momentum(scene, q[:-1], v[:-1], start)
     else:
-        M, _ = node_jets(scene, q[:-1], v[:-1])
+        M, _ = scene.core.jets(q[:-1], v[:-1])
         to_state = np.asarray(np.linalg.inv(M), dtype=np.float64)
         jump, jump_x = _in_velocity(scene, q[:-1], start, to_state)
     G = left * (Jk @ jump)
@@ -275,14 +275,9 @@ def second_order_steps(scene: Scene, trajectory: Trajectory, z: Floats, integrat
     return Curvature(xx=H[:, x, x], ux=B.T @ H[:, f, x], uu=B.T @ H[:, f, f] @ B)
 
 
-def node_jets(scene: Scene, q: Floats, v: Floats) -> tuple[Floats, Floats]:
-    """M and L_vq at many (q, v): each (N, n, n)."""
-    return scene.core.jets(np.ascontiguousarray(q), np.ascontiguousarray(v))
-
-
 def velocity_at_nodes(scene: Scene, q: Floats, v: Floats) -> Floats:
     """Derivative of v in (q, p) at many nodes (N, n, 2n): at fixed q dv = M^-1 dp, at fixed p dv = -M^-1 L_vq dq."""
-    return scene.core.velocity_slopes(np.ascontiguousarray(q), np.ascontiguousarray(v))
+    return scene.core.velocity_slopes(q, v)
 
 
 def velocity_curvature(scene: Scene, q: Floats, v: Floats, c: Floats) -> Floats:
@@ -293,7 +288,7 @@ def velocity_curvature(scene: Scene, q: Floats, v: Floats, c: Floats) -> Floats:
     N, n = q.shape
     first = velocity_at_nodes(scene, q, v)
     y = np.einsum("Nij,Nj->Ni", first[:, :, n:], c)
-    _, dA, dLqq = scene.core.jets_along(np.ascontiguousarray(q), np.ascontiguousarray(v), np.zeros_like(y), -y)
+    _, dA, dLqq = scene.core.jets_along(q, v, np.zeros_like(y), -y)
     D = np.concatenate([np.broadcast_to(np.eye(n, 2 * n), (N, n, 2 * n)), first], axis=1)
     inner = np.block([[dLqq, np.swapaxes(dA, 1, 2)], [dA, np.zeros_like(dA)]])
     second: Floats = np.swapaxes(D, 1, 2) @ inner @ D
@@ -312,7 +307,7 @@ def _in_momentum(scene: Scene, q: Floats, v: Floats, fields: Fields) -> Floats:
     Fx = np.zeros((N, n, k, 2 * n))
     Fx[..., :n] = fields.Fq
     if fields.Fv is not None:
-        M, A = node_jets(scene, q, v)
+        M, A = scene.core.jets(q, v)
         Fx[..., n:] = np.swapaxes(np.linalg.solve(M[:, None], np.swapaxes(fields.Fv, 2, 3)), 2, 3)
         Fx[..., :n] -= np.einsum("Naip,Npb->Naib", Fx[..., n:], A)
     return Fx
@@ -325,7 +320,7 @@ def _in_velocity(scene: Scene, q: Floats, fields: Fields, inverse: Floats) -> tu
     """
     N, n, k = fields.F.shape
     y = inverse @ fields.F
-    _, bend = node_jets(scene, np.repeat(q, k, axis=0), np.ascontiguousarray(np.swapaxes(y, 1, 2)).reshape(N * k, n))
+    _, bend = scene.core.jets(np.repeat(q, k, axis=0), np.swapaxes(y, 1, 2).reshape(N * k, n))
     Fx = np.zeros((N, n, k, 2 * n))
     Fx[..., :n] = fields.Fq - np.swapaxes(bend.reshape(N, k, n, n), 1, 2)
     if fields.Fv is not None:
@@ -349,9 +344,10 @@ def _drift_derivatives(
         parts = trajectory.q[j], trajectory.v[j], *(trajectory.u_nodes[j : j + 2] if linear else (u, u))
 
         def drift(x: Floats) -> Floats:
-            q, v, begin, end = np.split(x, [n, 2 * n, 2 * n + m])
-            ends = (begin[None], end[None]) if linear else None
-            return diffusion_and_drift(scene, q, v, 0.5 * (begin + end), start, ends)[1]
+            q, v, begin, end = np.split(x[None], [n, 2 * n, 2 * n + m], axis=1)
+            ends = (begin, end) if linear else None
+            found = ito_drift(scene.core, q, v, over_steps(scene.noise, q, v, 0.5 * (begin + end), ends, start))
+            return found.ravel()
 
         sizes = [np.full(part.size, 2e-3 * max(1.0, np.abs(part).max(initial=0.0))) for part in parts]
         found[j] = slopes(drift, np.concatenate(parts), np.concatenate(sizes))

@@ -22,7 +22,7 @@ from varpin.io.archive import Axes, read_npz, record_of, save_npz
 from varpin.model import Robot, require_robot
 from varpin.support.checks import count, path_like
 from varpin.support.frozen import Frozen
-from varpin.support.markup import facts, table, warning_count
+from varpin.support.markup import facts, joint_table, warning_count
 
 Bytes = NDArray[np.uint8]
 
@@ -343,11 +343,10 @@ class Trajectory(Frozen):
     def _repr_html_(self) -> str:
         warnings = [("warning", warning) for warning in self.warnings]
         rows = [("integrator", self.integrator), *self.overview, *warnings]
-        ends = zip(self.joint_names, self.q[0], self.q[-1], self.q.min(axis=0), self.q.max(axis=0), strict=True)
-        speeds = np.abs(self.v).max(axis=0)
-        joints = [(name, *map(float, row), float(speed)) for (name, *row), speed in zip(ends, speeds, strict=True)]
-        head = ("joint", "q at first [rad or m]", "in the end", "least", "most", "fastest [1/s]")
-        return facts(f"Trajectory of {self.robot}", rows, table(head, joints))
+        columns = {"q at first [rad or m]": self.q[0], "in the end": self.q[-1]}
+        columns |= {"least": self.q.min(axis=0), "most": self.q.max(axis=0)}
+        columns |= {"fastest [1/s]": np.abs(self.v).max(axis=0)}
+        return facts(f"Trajectory of {self.robot}", rows, joint_table(self.joint_names, columns))
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the trajectory as a compressed npz file without pickle; returns its path.

@@ -99,6 +99,18 @@ std::tuple<Out, Out, std::size_t> linearize(const Mechanism& mechanism, Explicit
     return {Jx, Jf, s};
 }
 
+// The coefficients c (s), k and l (s, s), x and y (s) of a method.
+std::tuple<Out, Out, Out, Out, Out> nystroem(ExplicitMethod method) {
+    const Nystroem own = nystroem_of(method);
+    const auto s = static_cast<std::size_t>(own.stages);
+    const Out k = array_for({s, s}), l = array_for({s, s});
+    for (std::size_t i = 0; i < s; ++i) {
+        std::copy_n(own.stage_q[i], s, k.data() + i * s);
+        std::copy_n(own.stage_v[i], s, l.data() + i * s);
+    }
+    return {array_of(own.reach, {s}), k, l, array_of(own.end_q, {s}), array_of(own.end_v, {s})};
+}
+
 ExplicitRollout rollout(const Mechanism& mechanism, ExplicitMethod method, In<2> q, In<2> v) {
     const auto [n, paths] = rows_of(mechanism, "q", q, "v", v);
     return {mechanism, method, static_cast<std::int64_t>(paths), q.data(), v.data()};
@@ -189,6 +201,7 @@ void register_explicit(nb::module_& m) {
             "copy", [](const ExplicitRollout& own) { return ExplicitRollout(own); }, nb::keep_alive<0, 1>())
         .def("first_nodes", &first_nodes, "nodes"_a)
         .def("roll", &roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a, "impulses"_a = nb::none());
+    m.def("nystroem", &nystroem, "method"_a);
     m.def("accelerations", &accelerations, "mechanism"_a, "q"_a, "v"_a, "force"_a);
     m.def("inverse_dynamics", &inverse_dynamics, "mechanism"_a, "q"_a, "v"_a, "a"_a);
     m.def("linearize_explicit", &linearize, "mechanism"_a, "method"_a, "dt"_a, "q"_a, "v"_a, "force"_a,

@@ -1,6 +1,7 @@
 // The mechanism and its Lagrangian jet.
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/map.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
@@ -230,8 +231,11 @@ Tree tree_of(nb::handle tree) {
     return out;
 }
 
+// A Python function that has the noise of a step, the processes that see slopes, and whether a field depends on v.
+using OuterNoise = std::optional<std::tuple<nb::object, Integers<1>, bool>>;
+
 // The diffusion fields of n coordinates and m controls, the Python named tuple Diffusion.
-Diffusion diffusion_of(nb::handle fields, std::size_t n, std::size_t m) {
+Diffusion diffusion_of(nb::handle fields, const OuterNoise& outer, std::size_t n, std::size_t m) {
     const std::size_t k = field<In<2>>(fields, "constant").shape(1);
     const auto numbers = [&](const double* from, std::size_t size) { return std::vector<double>(from, from + size); };
     const auto entries = [&](const char* name) { return numbers(field<In<2>>(fields, name, {n, k}), n * k); };
@@ -247,6 +251,22 @@ Diffusion diffusion_of(nb::handle fields, std::size_t n, std::size_t m) {
         }
         if (depends) out.sloped.push_back(static_cast<int>(w));
     }
+    if (!outer) return out;
+    const auto& [function, sloped, by_velocity] = *outer;
+    out.sloped.assign(sloped.data(), sloped.data() + sloped.size());
+    out.by_velocity = by_velocity;
+    out.outer = [function, n, m, k, all = k + sloped.size(), by_velocity](
+                    const double* q, const double* v, const double* center, const double* mean, const double* change,
+                    const double* increments, StepNoise& to) {
+        nb::gil_scoped_acquire acquire;
+        const auto found = nb::cast<std::tuple<In<1>, In<1>>>(
+            function(array_of(q, {n}), array_of(v, {n}), array_of(center, {n, k}), array_of(mean, {m}),
+                     array_of(change, {change ? m : 0}), array_of(increments, {increments ? change ? all : k : 0})));
+        const auto& [impulse, drift] = found;
+        require(impulse, "impulse", {n});
+        require(drift, "drift", {by_velocity ? n : 0});
+        to = {copied(impulse), copied(drift)};
+    };
     return out;
 }
 
@@ -270,7 +290,8 @@ Couplings couplings_of(const NamedCouplings& couplings, const std::vector<Body>&
 }
 
 Mechanism mechanism_of(nb::handle tree, In<1> gravity, const Named& forces, const NamedCouplings& couplings,
-                       const NamedConstraints& constraints, nb::object custom, In<2> actuation, nb::handle diffusion) {
+                       const NamedConstraints& constraints, nb::object custom, In<2> actuation, nb::handle diffusion,
+                       const OuterNoise& noise) {
     Mechanism out;
     out.tree = tree_of(tree);
     const std::size_t n = out.tree.armature.size(), m = actuation.shape(1);
@@ -288,7 +309,7 @@ Mechanism mechanism_of(nb::handle tree, In<1> gravity, const Named& forces, cons
                 out.actuation.push_back({static_cast<int>(r), static_cast<int>(c), actuation(r, c)});
         }
     }
-    out.diffusion = diffusion_of(diffusion, n, m);
+    out.diffusion = diffusion_of(diffusion, noise, n, m);
     return out;
 }
 
@@ -423,7 +444,7 @@ void register_mechanism(nb::module_& m) {
     m.def("coupling_kinds", &kinds_of<CoupledElement>);
     nb::class_<Mechanism>(m, "Mechanism")
         .def_static("make", &mechanism_of, "tree"_a, nb::kw_only(), "gravity"_a, "forces"_a, "couplings"_a,
-                    "constraints"_a, "custom"_a.none(), "actuation"_a, "diffusion"_a)
+                    "constraints"_a, "custom"_a.none(), "actuation"_a, "diffusion"_a, "noise"_a.none() = nb::none())
         .def("jet", &jet, "q"_a, "v"_a)
         .def("jets", &jets, "q"_a, "v"_a)
         .def("velocity_slopes", &velocity_slopes_at, "q"_a, "v"_a)

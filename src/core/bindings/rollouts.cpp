@@ -109,16 +109,6 @@ class Rollout {
         return true;
     }
 
-    // Add an impulse (P, n) to the momenta.
-    void kick(In<2> impulse) {
-        require(impulse, "impulse", {states_.size(), size()});
-        const Turn stepper(*shared_);
-        for (std::size_t i = 0; i < states_.size(); ++i) {
-            stepper->factor_at(states_[i]);
-            stepper->kick(impulse.data() + i * size(), states_[i]);
-        }
-    }
-
     void roll(double h, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes,
               const std::optional<In<4>>& impulses) {
         const Turn stepper(*shared_);
@@ -131,19 +121,15 @@ class Rollout {
                    });
     }
 
-    // Configurations, momenta, velocities (P, n) and energies (P).
-    std::tuple<Out, Out, Out, Out> nodes() const {
-        const std::size_t n = size(), P = states_.size();
-        const Out Q = array_for({P, n}), MV = array_for({P, n}), V = array_for({P, n});
-        const Out E = array_for({P});
-        for (std::size_t i = 0; i < P; ++i) {
-            const PathState& path = states_[i];
-            std::copy(path.q.begin(), path.q.end(), Q.data() + i * n);
-            std::copy(path.momentum.begin(), path.momentum.end(), MV.data() + i * n);
-            std::copy(path.v.begin(), path.v.end(), V.data() + i * n);
-            E.data()[i] = path.energies.total();
+    // Write the node that each path is at.
+    bool first_nodes(nb::handle nodes) const {
+        const Nodes to = nodes_of(*mechanism_, nodes, states_.size());
+        if (to.steps < 1) throw std::invalid_argument("the nodes have no rows for the first nodes");
+        for (std::int64_t i = 0; i < to.paths; ++i) {
+            record_node(states_[i], static_cast<int>(size()), to, i * to.steps);
+            to.done[i] = 1;
         }
-        return {Q, MV, V, E};
+        return true;
     }
 
     // The halvings of each part of every divided step in the last roll of a path.
@@ -252,8 +238,7 @@ void register_rollouts(nb::module_& m) {
         .def("begin", &Rollout::begin, "q"_a, "v"_a)
         .def("roll", &Rollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a,
              "impulses"_a = nb::none())
-        .def("kick", &Rollout::kick, "impulse"_a)
-        .def("nodes", &Rollout::nodes)
+        .def("first_nodes", &Rollout::first_nodes, "nodes"_a)
         .def("halvings", &Rollout::halvings, "path"_a)
         .def("impulses", &Rollout::impulses, "path"_a)
         .def("weakest", &Rollout::weakest, "path"_a);

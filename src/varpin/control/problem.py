@@ -353,7 +353,7 @@ class OptimalControlProblem(Frozen):
         found["joints"] = ", ".join(self.scene.robot.joint_names)
         values = {name: array for name, array in self.scene.values.items() if not name.startswith("noise.")}
         found |= {f"scene.{name}": array for name, array in values.items()}
-        found |= {f"noise.{name}": array for name, array in self.scene.diffusion._asdict().items()}
+        found |= {f"noise.{name}": array for name, array in self.scene.noise.arrays._asdict().items()}
         found["constraints"] = ", ".join(item.label for item in self.constraints)
         found["integrator"] = repr(self.integrator)
         path = 0.1 * np.sin(np.outer(np.arange(self.steps + 1), 1.0 + np.arange(len(self.q0))))

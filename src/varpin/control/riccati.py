@@ -120,7 +120,7 @@ def _pass(steps: Steps, given: Recursion, regularization: float, *, second: bool
         if final is None or running is None:
             return None
         found = RootPass(m, final.after(steps.slopes[-1]).padded(X), gradient)
-        failed = found.run(problem.dt, problem.hold, float(regularization), running=running, **arrays)
+        failed = found.run(problem.dt, problem.hold, float(regularization), **(arrays | {"hessian": running}))
     else:
         found = core.BackwardPass(m, gradient, hessian)
         failed = found.run(problem.dt, problem.hold, float(regularization), **arrays)

@@ -9,7 +9,7 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.stages import Steps
-from varpin.linearization import node_jets, second_order_steps, velocity_curvature
+from varpin.linearization import second_order_steps, velocity_curvature
 from varpin.mechanics.scene import quiet
 from varpin.signals.commands import with_ends
 from varpin.trajectory import Trajectory
@@ -53,7 +53,7 @@ def _on_lines(problem: OptimalControlProblem, trajectory: Trajectory, z: Floats,
     N, x = len(z), 2 * n
     found = np.zeros((N, x + 2 * m, x + 2 * m))
     found[:, :x, :x] = in_state
-    M, _ = node_jets(scene, trajectory.q[:-1], trajectory.v[:-1])
+    M, _ = scene.core.jets(trajectory.q[:-1], trajectory.v[:-1])
     speeds = np.abs(h * np.linalg.solve(M, np.broadcast_to(scene.actuation, (N, n, m)))).max(axis=1)
     shift = _SHIFT / np.where(speeds > 0.0, speeds, 1.0)
     # Positions, and velocities of cubics.

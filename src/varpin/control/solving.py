@@ -25,7 +25,6 @@ from varpin.control.solution import Solution
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, VarpinError
 from varpin.finding import announce
-from varpin.linearization import node_jets
 from varpin.mechanics.forces import of_kind
 from varpin.model import degrees_hint
 from varpin.signals.commands import as_moved, with_ends
@@ -313,7 +312,7 @@ def _policy_along(problem: OptimalControlProblem, path: _Path, controls: object)
     u = np.clip(u, *problem.control_limits)
     q, v = q[:-1:hold], v[:-1:hold]
     if problem.integrator.variational:
-        v = (node_jets(scene, q, v)[0] @ v[:, :, None])[:, :, 0]
+        v = (scene.core.jets(q, v)[0] @ v[:, :, None])[:, :, 0]
     gains = np.tile(problem.feedback(FASTEST / problem.period), (len(q), 1, 1))
     if not problem.linear:
         return problem.policy_of(u, gains, np.hstack([q, v]))

@@ -81,21 +81,20 @@ class RootPass:
         Gx: Floats,
         Gu: Floats,
         gradient: Floats,
-        hessian: Floats,  # noqa: ARG002 - in `running`, as squares
+        hessian: Squares,
         feedforward: Floats,
         feedback: Floats,
         control_gradient: Floats,
         spread: Floats,
         factors: Floats,
-        running: Squares,
     ) -> int:
-        """As :meth:`varpin.core.BackwardPass.run`, with the ``running`` cost as squares."""
+        """As :meth:`varpin.core.BackwardPass.run`, with the running cost as squares, its ``hessian``."""
         m, x, N = self.m, self.x, len(A)
         order = np.r_[x : x + m, :x]  # from (x, u) to (u, x)
         J = np.concatenate([B, A], axis=2)
-        sizes, gradient, linear = np.abs(J), h * gradient[:, order], h * running.linear[:, order]
-        roots = np.broadcast_to(running.root[:, :, order], (N, m + x, m + x))
-        costs = np.sqrt(h) * np.concatenate([roots, running.shift[:, :, None]], axis=2)
+        sizes, gradient, linear = np.abs(J), h * gradient[:, order], h * hessian.linear[:, order]
+        roots = np.broadcast_to(hessian.root[:, :, order], (N, m + x, m + x))
+        costs = np.sqrt(h) * np.concatenate([roots, hessian.shift[:, :, None]], axis=2)
         jumps, turns = G.transpose(0, 2, 1), np.concatenate([Gu, Gx], axis=3).transpose(0, 2, 1, 3)
         for s in range(N - 1, -1, -1):
             before = self.rows

@@ -29,8 +29,13 @@ class Mechanism:
         custom: Callable[[Floats, Floats, bool], tuple[Floats, Floats, Floats]] | None,
         actuation: Floats,
         diffusion: Diffusion,
+        noise: tuple[Callable[..., tuple[Floats, Floats]], Integers, bool] | None = None,
     ) -> Mechanism:
-        """Raises ValueError for arrays that do not fit each other or describe no tree."""
+        """Raises ValueError for arrays that do not fit each other or describe no tree.
+
+        ``noise`` is a :class:`varpin.mechanics.noise.StepNoise`, the processes that see the slope of a control within
+        a step, and whether a field depends on the velocity.
+        """
 
     def jet(self, q: Floats, v: Floats) -> tuple[float, Floats, Floats, Floats, Floats, Floats]:
         """L, L_q, L_v, L_qq, L_vq and L_vv at q, v (n,)."""
@@ -124,11 +129,8 @@ class Rollout:
         and after each step, or held over it as the noise; under constraints they have to be held.
         """
 
-    def kick(self, impulse: Floats) -> None:
-        """Add an impulse (P, n) to the momenta; constraints absorb its normal component."""
-
-    def nodes(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """Configurations, momenta and velocities (P, n), and energies (P,)."""
+    def first_nodes(self, nodes: RolloutArrays) -> bool:
+        """Write the node that each path is at, as :class:`ExplicitRollout`; True."""
 
     def halvings(self, path: int) -> Bytes:
         """The halvings of each part of every divided step in the last roll of a path, in order."""
@@ -300,6 +302,9 @@ def element_kinds() -> dict[str, tuple[int, bool, bool]]:
 
 def coupling_kinds() -> dict[str, tuple[int, bool, bool]]:
     """The same of couplings, without the positions of their two points."""
+
+def nystroem(method: ExplicitMethod) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """C (s,), k and l (s, s), x and y (s,) of a method with s stages, as in src/core/include/varpin/explicit.hpp."""
 
 def accelerations(
     mechanism: Mechanism, q: Floats, v: Floats, force: Floats

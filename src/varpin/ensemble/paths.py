@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import copy
-import dataclasses
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands
-from varpin.ensemble.record import Ensemble, PathFailure, PathsInterrupted
+from varpin.ensemble.record import PathFailure, PathsInterrupted
 from varpin.errors import InputError, VarpinError, WorkersLost
 from varpin.finding import Finding
 from varpin.integrators import Integrator, Segment
@@ -47,9 +45,7 @@ _CHUNKS, _LEAST_STEPS, _MOST_STEPS, _FEWEST_PATHS, _MOST_PATHS = 64, 4_000, 200_
 
 def without_geometry(scene: Scene) -> Scene:
     """The scene without its robot's shapes: no simulation needs them, and meshes are large to send to a worker."""
-    bare = copy.copy(scene)
-    vars(bare)["robot"] = dataclasses.replace(scene.robot, visuals=None, parts=())
-    return bare
+    return scene.changed(robot=replace(scene.robot, visuals=None, parts=()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,11 +70,10 @@ class Shared(Frozen):
         return "p" if self.integrator.variational else "v"
 
     def chunks(self, paths: int) -> Iterator[tuple[int, int]]:
-        """The first path of each chunk, and one past its last; single paths where Python evaluates the noise."""
+        """The first path of each chunk, and one past its last."""
         steps = max(1, self.steps)
         size = min(max(math.ceil(paths / _CHUNKS), _LEAST_STEPS // steps), _MOST_STEPS // steps, _MOST_PATHS)
         size = max(size, _FEWEST_PATHS) if size <= _GROUP else math.ceil(size / _GROUP) * _GROUP
-        size = 1 if self.scene.noise.diffusion is None else size
         return ((first, min(first + size, paths)) for first in range(0, paths, size))
 
     def shape(self, name: str) -> tuple[int, ...]:
@@ -270,7 +265,7 @@ class Paths(ABC):
                     found = self.findings(None)
                 kept = self.result((*self.lost(), *found)) if self.done else None
                 if isinstance(stop, WorkersLost):
-                    raise WorkersLost(stop.__cause__, kept if isinstance(kept, Ensemble) else None) from stop.__cause__
+                    raise WorkersLost(stop.__cause__, kept) from stop.__cause__
                 raise PathsInterrupted(kept, self.done) from None
 
     def findings(self, pool: Executor | None) -> tuple[Finding, ...]:

@@ -15,7 +15,7 @@ from varpin.finding import Finding
 from varpin.io.archive import Axes, read_npz, record_of, save_npz
 from varpin.support.checks import path_like
 from varpin.support.frozen import Frozen
-from varpin.support.markup import Printed, warning_count
+from varpin.support.markup import Printed, joint_table, warning_count
 
 FORMAT = "varpin.ensemble/1"
 
@@ -82,6 +82,7 @@ class Ensemble(Printed, Frozen):
         warnings: One of each kind: errors, limits, paths that stopped early. The first path, the one with the most
             split steps, the one with the most energy and the fastest are checked as :func:`varpin.simulate` does.
         integrator: The integrator of all paths.
+        joint_names: Names of the coordinates; empty in files of 0.1.
     """
 
     t: Annotated[Floats, Axes("nodes", finite=True)]
@@ -94,6 +95,7 @@ class Ensemble(Printed, Frozen):
     failures: tuple[PathFailure, ...] = ()
     warnings: tuple[Finding, ...] = ()
     integrator: str = ""
+    joint_names: tuple[str, ...] = ()
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the ensemble as a compressed npz file without pickle; returns its path.
@@ -126,6 +128,12 @@ class Ensemble(Printed, Frozen):
         own = self.statistics
         energy = f"energy [J]: {own.energy_mean[-1]:.4g} +- {own.energy_deviation[-1]:.2g} in the end"
         return "\n".join([repr(self), energy, *(f"warning: {warning}" for warning in self.warnings)])
+
+    def _repr_html_(self) -> str:
+        mean, deviation = self.statistics.mean[-1], np.sqrt(np.diagonal(self.statistics.covariance[-1]))
+        n = len(self.joint_names)
+        columns = {"mean of q in the end [rad or m]": mean[:n], "standard deviation": deviation[:n]}
+        return super()._repr_html_() + joint_table(self.joint_names, columns)
 
 
 class PathsInterrupted(KeyboardInterrupt):

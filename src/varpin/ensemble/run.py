@@ -273,6 +273,7 @@ class Sums(Paths):
             failures=tuple(self.failures),
             warnings=tuple(found),
             integrator=str(self.shared.integrator),
+            joint_names=self.shared.scene.robot.joint_names,
         )
 
     def _quantiles(self) -> Floats:

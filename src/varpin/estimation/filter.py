@@ -23,7 +23,7 @@ from varpin.estimation.grid import Grid
 from varpin.estimation.log import Log, as_log
 from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
-from varpin.linearization import node_jets, require_covariance, velocity_at_nodes
+from varpin.linearization import require_covariance, velocity_at_nodes
 from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
 from varpin.simulation.choice import given_integrator, usual_integrator
 from varpin.support.checks import JointValues, finite_array, joint_array, positive
@@ -302,7 +302,7 @@ def _of_state(scene: Scene, q: Floats, v: Floats, P: Floats, *, variational: boo
     """Mean and covariance of the filter's state from those of (q, v): dp = L_vq dq + M dv."""
     if not variational:
         return np.concatenate([q, v]), P
-    M, A = (jet[0] for jet in node_jets(scene, q[None], v[None]))
+    M, A = (jet[0] for jet in scene.core.jets(q[None], v[None]))
     to = np.block([[np.eye(q.size), np.zeros_like(M)], [A, M]])
     return np.concatenate([q, M @ v]), to @ P @ to.T
 
@@ -313,7 +313,7 @@ def _in_velocities(scene: Scene, x: Floats, P: Floats, *, variational: bool) -> 
     q, v, more = (part.copy() for part in np.split(x, [n, 2 * n], axis=1))
     covariance, of_more = P[:, : 2 * n, : 2 * n].copy(), P[:, 2 * n :, 2 * n :]
     if variational:
-        v = np.asarray(np.linalg.solve(node_jets(scene, q, v)[0], v[:, :, None])[:, :, 0])
+        v = np.asarray(np.linalg.solve(scene.core.jets(q, v)[0], v[:, :, None])[:, :, 0])
         to = np.tile(np.eye(2 * n), (len(q), 1, 1))
         to[:, n:] = velocity_at_nodes(scene, q, v)
         covariance = to @ covariance @ np.swapaxes(to, 1, 2)

@@ -15,7 +15,7 @@ from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.estimation.parameters import parameters_of
 from varpin.integrators.base import Integrator, Varied
-from varpin.linearization import Linearization, linearize, matching_integrator, node_jets, velocity_at_nodes
+from varpin.linearization import Linearization, linearize, matching_integrator, velocity_at_nodes
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.support.checks import finite_array
 from varpin.trajectory import Trajectory
@@ -155,10 +155,10 @@ def motion_map(
 ) -> MotionMap:
     """The map of a motion with its linearization."""
     q, v, n = motion.q, motion.v, scene.robot.dof
-    M, Lvq = node_jets(scene, q, v)
+    M, Lvq = scene.core.jets(q, v)
     to_p, pull = np.concatenate([Lvq, M], axis=2), np.zeros((*q.shape, len(varied)))
     for k, each in enumerate(varied):
-        above, below = (node_jets(near, q, v)[0] for near in (each.above, each.below))
+        above, below = (near.core.jets(q, v)[0] for near in (each.above, each.below))
         pull[:, :, k] = np.einsum("kij,kj->ki", above - below, v) / each.distance
     A, B, D = linear.A, linear.B, np.zeros((len(linear.A), 2 * n, 0))
     if varied:

@@ -15,19 +15,9 @@ import numpy as np
 from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands, FilterArrays, FilterLog, RolloutArrays, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
-from varpin.mechanics.noise import Fields, over_steps
+from varpin.mechanics.noise import Fields, ito_drift, over_steps
 from varpin.mechanics.scene import Scene
-from varpin.signals.commands import (
-    contiguous,
-    control_of,
-    in_parts_of_steps,
-    lines,
-    open_loop,
-    prescribing,
-    rows,
-    steps_of,
-    with_ends,
-)
+from varpin.signals.commands import contiguous, steps_of, with_ends
 from varpin.trajectory import StepStatistics, Trajectory, joined
 
 # Fields of a segment with one row for each node.
@@ -85,8 +75,8 @@ class Varied(NamedTuple):
 class Run:
     """State of a rollout."""
 
-    paths: Any  # with a method ``roll``, as those of the core; it holds their work arrays
-    start: Floats  # initial configurations (P, n) [rad or m]
+    paths: Any  # with the methods ``first_nodes``, ``roll`` and ``copy``, as those of the core; it has work arrays
+    count: int  # P
     driven: bool = False  # whether the scene has kinematic inputs
 
 
@@ -95,11 +85,9 @@ class Integrator(ABC):
 
     A subclass provides
 
-    1. ``begun``, the paths of a rollout at (q0, v0), and ``fork``, which copies them;
+    1. ``begun``, the paths of a rollout at (q0, v0);
     2. ``linearize``, the derivatives of its steps, and ``quiet_ends`` if it applies noise after a step too;
     3. ``variational``, True if it maps (q, p) and False if it maps (q, v), ``order``, and ``reasons``.
-
-    Its paths advance by ``roll``, whose arguments are those of the core's paths.
     """
 
     variational: bool
@@ -175,7 +163,7 @@ class Integrator(ABC):
         run, nodes = self.begun(scene, q0, v0), new_nodes(len(q0), 1, scene.robot.dof, scene.controls)
         if scene.custom is not None:
             scene.custom.check(q0, v0)
-        if not self._first(run, nodes):
+        if not run.paths.first_nodes(nodes):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
         return run, segments_of(nodes, self.reasons)
 
@@ -188,61 +176,31 @@ class Integrator(ABC):
             SingularMassMatrix: As :meth:`start`, at the latest there.
         """
 
-    def _first(self, run: Run, nodes: RolloutArrays) -> bool:
-        """Write the first node of each path; False if a mass matrix is not positive definite."""
-        return bool(run.paths.first_nodes(nodes))
-
     def fork(self, state: Run) -> Run:
         """An independent copy of a state, with this integrator's guard and shared work arrays."""
         return replace(state, paths=state.paths.copy())
 
-    def _state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
-        """The q, p and v (n,) of the only path; p is empty for integrators on (q, v)."""
-        return state.paths.q[0], state.paths.q[0, :0], state.paths.v[0]
-
-    def rollout(self, scene: Scene, state: Run, commands: Commands, increments: Floats, dt: float) -> list[Segment]:
-        """Advance ``state`` by the N steps of ``commands``, each of length ``dt`` [s].
-
-        ``increments`` are the Wiener increments (P, N, k) [s^0.5], or (0, 0, k) for none; (P, N, K), those of slopes
-        included (:meth:`Scene.increments`), for controls that are linear between nodes. Returns a segment for each
-        path; with diffusion fields that only Python can evaluate there is one path.
-        """
-        if scene.noise.diffusion is not None:
-            return self.rollout_compiled(scene, state, contiguous(commands), increments, scene.no_drift, dt)
-        segments: list[Segment] = []
-        hold, before = commands.hold, commands.before
-        for j in range(steps_of(commands) // hold):
-            q, p, v = self._state_of(state)
-            decided = control_of(commands, j, np.concatenate([q, p if self.variational else v]), before)
-            row = rows(commands, j, j + 1, before)
-            now, begins, ends = self._controls(scene, row, np.tile(decided, (hold, 1)), q, v, dt)
-            for k in range(hold):
-                drawn = increments[0, j * hold + k] if len(increments) else None
-                around = begins[k : k + 1], ends[k : k + 1]
-                segments.append(self._step_in_python(scene, state, rows(now, k, k + 1), around, drawn, dt))
-                segments[-1].u[:] = decided
-                if segments[-1].failure is not None:
-                    return [join(segments)]
-            before = decided[None]
-        return [join(segments)]
-
-    def rollout_compiled(
+    def rollout(
         self,
         scene: Scene,
         state: Run,
         commands: Commands,
         increments: Floats,
-        drift: Floats,
         dt: float,
+        *,
+        drift: Floats | None = None,
         impulses: Floats | None = None,
     ) -> list[Segment]:
-        """:meth:`rollout` with fields that the core evaluates; ``drift`` is a force (P, N, n), or (0, 0, n).
+        """Advance ``state`` by the N steps of ``commands``, each of length ``dt`` [s]; a segment for each path.
 
-        ``impulses`` (P, N, 2, n) are added to the momenta before and after each step, but not under constraints; an
-        integrator that holds the noise spreads them over the step.
+        ``increments`` are the Wiener increments (P, N, k) [s^0.5], or (0, 0, k) for none; (P, N, K), those of slopes
+        included (:meth:`Scene.increments`), for controls that are linear between nodes. ``drift`` is a force (P, N, n)
+        instead of the drift of the noise. ``impulses`` (P, N, 2, n) are added to the momenta before and after each
+        step, but not under constraints; an integrator that holds the noise spreads them over the step.
         """
-        nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
-        state.paths.roll(dt, commands, increments, drift, nodes, impulses=impulses)
+        nodes = new_nodes(state.count, steps_of(commands), scene.robot.dof, scene.controls)
+        drift = scene.no_drift if drift is None else drift
+        state.paths.roll(dt, contiguous(commands), increments, drift, nodes, impulses=impulses)
         return self._segments(scene, state.paths, nodes)
 
     def _segments(self, scene: Scene, paths: Any, nodes: RolloutArrays) -> list[Segment]:  # noqa: ARG002
@@ -254,7 +212,7 @@ class Integrator(ABC):
     ) -> tuple[Floats, Floats] | None:
         """Configurations and velocities (P, N, n) after each step of P motions from (q0, v0) (P, n), without noise.
 
-        ``commands`` are as for :meth:`rollout_compiled`. Returns None if a motion fails.
+        ``commands`` are as for :meth:`rollout`. Returns None if a motion fails.
         """
         try:
             state = self.begun(scene, q0, v0)
@@ -263,55 +221,6 @@ class Integrator(ABC):
         nodes = new_nodes(len(q0), steps_of(commands), scene.robot.dof, scene.controls)
         state.paths.roll(dt, commands, scene.silence, scene.no_drift, nodes)
         return None if nodes.ended.any() else (nodes.q, nodes.v)
-
-    def kicked(
-        self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
-    ) -> Segment:
-        """One step of the only path under a drift (n,), with a noise impulse (n,) or its first part."""
-        kicks = None
-        if impulse is not None:
-            kicks = np.zeros((1, 1, 2, impulse.size))
-            kicks[0, 0, 0] = self.left * impulse
-        return self.rollout_compiled(scene, state, command, scene.silence, drift[None, None], dt, kicks)[0]
-
-    def _controls(
-        self, scene: Scene, row: Commands, decided: Floats, q: Floats, v: Floats, dt: float
-    ) -> tuple[Commands, Floats, Floats]:
-        """The steps of a decision (hold, m) at a state, and controls (hold, m) at begins and ends of steps."""
-        now, begins, ends = open_loop(decided)._replace(within=row.within), decided, decided
-        if len(row.stage_times):
-            mean, stages, nodes = lines(row, decided, self.stage_times)
-            now = open_loop(mean) if not stages.size else open_loop(mean)._replace(within=np.ascontiguousarray(stages))
-            begins, ends = nodes[:-1], nodes[1:]
-        if scene.inputs:
-            after = in_parts_of_steps(scene, decided[:1], q[None], v[None], dt * row.hold, row.hold)
-            now, begins, ends = prescribing(scene, now, after), *(with_ends(scene, u, after) for u in (begins, ends))
-        return now, begins, ends
-
-    def _step_in_python(
-        self, scene: Scene, state: Run, now: Commands, ends: tuple[Floats, Floats], drawn: Floats | None, dt: float
-    ) -> Segment:
-        """One step of one path with fields in Python, between controls ``ends`` (1, m), with increments ``drawn``."""
-        start, k = state.start[0], scene.processes
-        sloped = drawn is not None and drawn.size > k
-        around = ends if sloped or scene.noise.velocity_dependent else None
-
-        def noise() -> tuple[Floats | None, Floats]:
-            """The impulse of the increments at the state of the path, and the drift."""
-            q, _, v = self._state_of(state)
-            F, drift = diffusion_and_drift(scene, q, v, now.u[0], start, around)
-            if drawn is None:
-                return None, drift
-            impulse = F[:, :k] @ drawn[:k]
-            return impulse + F[:, k:] @ drawn[k:] if sloped else impulse, drift
-
-        impulse, drift = noise()
-        segment = self.kicked(scene, state, now, self.drift_share * drift, impulse, dt)
-        if impulse is not None and self.left < 1.0 and segment.failure is None:
-            impulse, _ = noise()
-            state.paths.kick((1.0 - self.left) * np.array([impulse]))
-            _, segment.p[-1:], segment.v[-1:], segment.energy[-1:] = state.paths.nodes()
-        return segment
 
     def quiet_ends(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
         """The ends of the steps at dw = 0, q and v (N, n), for integrators that apply noise after the step.
@@ -410,33 +319,12 @@ def join(segments: Sequence[Segment]) -> Segment:
     return Segment(**nodes, statistics=statistics, failure=segments[-1].failure, impulses=impulses)
 
 
-def diffusion_and_drift(
-    scene: Scene, q: Floats, v: Floats, u: Floats, start: Floats, ends: tuple[Floats, Floats] | None = None
-) -> tuple[Floats, Floats]:
-    """Diffusion fields F (n, K) at one state, and the Ito correction: the drift (n,) from Stratonovich to Ito.
-
-    The drift is (1/2) sum_i (dF_i/dv) M^-1 F_i [N m or N], equation (N1) and (1.3) of the paper; it is zero if no field
-    depends on the velocity. Of controls that are linear over a step between ``ends`` (1, m) it is the mean drift.
-    """
-    found = over_steps(scene.noise, q[None], v[None], u[None], ends, start)
-    return found.F[0], _drift(scene, q[None], v[None], found)[0]
-
-
-def _drift(scene: Scene, q: Floats, v: Floats, fields: Fields) -> Floats:
-    """The drift (N, n) of :func:`diffusion_and_drift` at (q, v) (N, n)."""
-    if fields.Fv is None:
-        return np.zeros_like(q)
-    M, _ = scene.core.jets(np.ascontiguousarray(q), np.ascontiguousarray(v))
-    drift: Floats = 0.5 * np.einsum("Nikj,Njk->Ni", fields.Fv, np.linalg.solve(M, fields.F))
-    return drift
-
-
 def drifts(scene: Scene, trajectory: Trajectory) -> Floats | float:
-    """The drift of :func:`diffusion_and_drift` at the start of every step (N, n), or 0 where none has any."""
+    """The drift of :func:`ito_drift` at the start of every step (N, n), or 0 where none has any."""
     if not scene.noise.velocity_dependent:
         return 0.0
     q, v = trajectory.q[:-1], trajectory.v[:-1]
-    return _drift(scene, q, v, noise_fields(scene, trajectory, q, v, trajectory.q[0]))
+    return ito_drift(scene.core, q, v, noise_fields(scene, trajectory, q, v, trajectory.q[0]))
 
 
 def noise_fields(
@@ -475,8 +363,7 @@ def forces(scene: Scene, trajectory: Trajectory, drift: Floats | float = 0.0) ->
     """Forces of the controls plus a drift (N, n): (N, 1, n), or (N, s, n) for controls that change within steps."""
     drift = drift[:, None] if isinstance(drift, np.ndarray) else drift
     u = trajectory.u_stages if trajectory.u_stages.shape[1] else trajectory.u[:, None]
-    total = u if scene.direct else u @ scene.actuation.T
-    return np.ascontiguousarray(total + drift if isinstance(drift, np.ndarray) else total)
+    return (u if scene.direct else u @ scene.actuation.T) + drift
 
 
 def gear(scene: Scene, other: Scene) -> Floats:

@@ -12,12 +12,11 @@ import scipy
 from varpin import core
 from varpin.arrays import Floats
 from varpin.core import ExplicitMethod, Mechanism, Outcome
-from varpin.core.arrays import Commands, FilterArrays, FilterLog
+from varpin.core.arrays import FilterArrays, FilterLog
 from varpin.errors import LinearizationError
 from varpin.integrators.base import (
     Integrator,
     Run,
-    Segment,
     Varied,
     drifts,
     forces,
@@ -36,19 +35,13 @@ class _Explicit(Integrator):
     """The base class of explicit methods."""
 
     method: ClassVar[ExplicitMethod]
-    # Times of the stages, and the weights of accelerations before them and at the end, as in explicit.hpp.
-    reach: ClassVar[tuple[float, ...]] = (0.0,)
-    stage_q: ClassVar[tuple[tuple[float, ...], ...]] = ((),)
-    stage_v: ClassVar[tuple[tuple[float, ...], ...]] = ((),)
-    end_q: ClassVar[tuple[float, ...]] = (0.0,)
-    end_v: ClassVar[tuple[float, ...]] = (1.0,)
     variational = False
     # In a motion no mass matrix but that of angles beyond rounding is singular.
     reasons = dict.fromkeys(REASONS, REASONS[Outcome.not_finite])
 
     def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
         refuse_constraints(scene, self)
-        return Run(core.ExplicitRollout.start(scene.core, self.method, q0, v0), q0.copy())
+        return Run(core.ExplicitRollout.start(scene.core, self.method, q0, v0), len(q0))
 
     def damped(self, z: Floats) -> tuple[Floats, Floats]:
         kept = np.polynomial.polynomial.polyval(-z, 1.0 / scipy.special.factorial(np.arange(self.order + 1)))
@@ -66,7 +59,7 @@ class _Explicit(Integrator):
 
     def _derivatives(self, scene: Scene, trajectory: Trajectory, *, ramp: bool = False) -> tuple[Floats, Floats]:
         h = trajectory.dt
-        q, v = (np.ascontiguousarray(x[:-1]) for x in (trajectory.q, trajectory.v))
+        q, v = trajectory.q[:-1], trajectory.v[:-1]
         force = forces(scene, trajectory, drifts(scene, trajectory))
         Jx, Jf, done = core.linearize_explicit(scene.core, self.method, h, q, v, force, ramp)
         if done < len(q):
@@ -81,22 +74,19 @@ class _Explicit(Integrator):
         h, q, v = trajectory.dt, trajectory.q[:-1], trajectory.v[:-1]
         own, around = forces(scene, trajectory), [each for pair in varied for each in (pair.above, pair.below)]
         given, distance = [forces(each, trajectory) for each in around], np.array([each.distance for each in varied])
-        a: list[Floats] = []
-        da: list[Floats] = []
-        for time, in_q, in_v in zip(self.reach, self.stage_q, self.stage_v, strict=True):
+        times, stage_q, stage_v, end_q, end_v = core.nystroem(self.method)
+        # Of all stages, zero before they are known.
+        a, da = np.zeros((len(times), *q.shape)), np.zeros((len(times), *q.shape, len(varied)))
+        for i, time in enumerate(times):
             at = self.stage_times.index(time) if own.shape[1] > 1 else 0
-            Q = np.ascontiguousarray(q + h * (time * v + h * _weighed(in_q, a, q)))
-            V = np.ascontiguousarray(v + h * _weighed(in_v, a, v))
-            values, aq, av, _ = accelerations(scene, Q, V, own[:, at])
-            pulls = [_pull(each.core, Q, V, values, f[:, at]) for each, f in zip(around, given, strict=True)]
+            Q = q + h * (time * v + h * np.tensordot(stage_q[i], a, 1))
+            V = v + h * np.tensordot(stage_v[i], a, 1)
+            a[i], aq, av, _ = accelerations(scene, Q, V, own[:, at])
+            pulls = [_pull(each.core, Q, V, a[i], f[:, at]) for each, f in zip(around, given, strict=True)]
             push = (np.stack(pulls[1::2], axis=2) - np.stack(pulls[::2], axis=2)) / distance
-            moved = np.linalg.solve(scene.core.jets(Q, V)[0], push)
-            none = np.zeros_like(moved)
-            moved = moved + h * (aq @ (h * _weighed(in_q, da, none)) + av @ _weighed(in_v, da, none))
-            a.append(values)
-            da.append(moved)
-        ends = h * h * _weighed(self.end_q, da, none), h * _weighed(self.end_v, da, none)
-        return np.concatenate(ends, axis=1)
+            before_q, before_v = (np.tensordot(weights[i], da, 1) for weights in (stage_q, stage_v))
+            da[i] = np.linalg.solve(scene.core.jets(Q, V)[0], push) + h * (aq @ (h * before_q) + av @ before_v)
+        return np.concatenate([h * h * np.tensordot(end_q, da, 1), h * np.tensordot(end_v, da, 1)], axis=1)
 
     def filtered(self, scene: Scene, log: FilterLog) -> FilterArrays:
         """See :meth:`Integrator.filtered`; the state is (q, v)."""
@@ -107,17 +97,8 @@ class _Explicit(Integrator):
         return in_v
 
 
-def _weighed(weights: Sequence[float], values: Sequence[Floats], none: Floats) -> Floats:
-    """The sum of some of the values by their weights; ``none`` without weights."""
-    total = np.zeros_like(none)
-    for weight, value in zip(weights, values, strict=True):
-        total += weight * value
-    return total
-
-
 def _pull(mechanism: Mechanism, q: Floats, v: Floats, a: Floats, force: Floats) -> Floats:
     """What accelerations (N, n) need beyond the forces that act (N, n) [N m or N]."""
-    force = np.ascontiguousarray(force)
     return core.inverse_dynamics(mechanism, q, v, a) - force - mechanism.forces(q, v, force)[0]
 
 
@@ -127,7 +108,6 @@ def accelerations(scene: Scene, q: Floats, v: Floats, force: Floats) -> tuple[Fl
     Raises:
         LinearizationError: A mass matrix is not positive definite.
     """
-    q, v, force = (np.ascontiguousarray(x) for x in (q, v, force))
     a, aq, av, af, done = core.accelerations(scene.core, q, v, force)
     if done < len(q):
         raise LinearizationError(0, 0.0, REASONS[Outcome.singular])
@@ -145,13 +125,6 @@ class ExplicitEuler(_Explicit):
     def damped(self, z: Floats) -> tuple[Floats, Floats]:
         return 1.0 - z, np.ones_like(z)
 
-    def kicked(
-        self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
-    ) -> Segment:
-        # As a constant force over the step, which is the same.
-        drift = drift if impulse is None else drift + impulse / dt
-        return super().kicked(scene, state, command, drift, None, dt)
-
     def _jump(self, in_v: Floats) -> Floats:
         n = in_v.shape[2]
         return np.tile(np.eye(2 * n, n, -n), (len(in_v), 1, 1))
@@ -162,7 +135,6 @@ class SemiImplicitEuler(_Explicit):
     """v1 = v0 + h a(q0, v0), q1 = q0 + h v1, of first order; the method of most physics engines."""
 
     method: ClassVar[ExplicitMethod] = ExplicitMethod.semi_implicit
-    end_q = (1.0,)
     order = 1
 
 
@@ -173,8 +145,3 @@ class RungeKutta4(_Explicit):
     method: ClassVar[ExplicitMethod] = ExplicitMethod.runge_kutta
     order = 4
     stage_times = (0.0, 0.5, 1.0)
-    reach = (0.0, 0.5, 0.5, 1.0)
-    stage_q = ((), (0.0,), (0.25, 0.0), (0.0, 0.5, 0.0))
-    stage_v = ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0))
-    end_q = (1 / 6, 1 / 6, 1 / 6, 0.0)
-    end_v = (1 / 6, 1 / 3, 1 / 3, 1 / 6)

@@ -75,7 +75,7 @@ class Reference(Integrator):
         refuse_constraints(scene, self)
         if scene.processes:
             raise InputError(f"{self} integrates no noise: leave it out of the scene")
-        return Run(_Paths(self, scene, np.hstack([q0, v0]), ForwardDynamics(scene.core)), q0.copy())
+        return Run(_Paths(self, scene, np.hstack([q0, v0]), ForwardDynamics(scene.core)), len(q0))
 
     def _force(self, values: Floats, dt: float) -> Force:
         """The force (n,) as a function of time [s] in a step, from values at its stages (s, n) or a constant (1, n)."""
@@ -161,8 +161,8 @@ class _Paths:
 
     def first_nodes(self, nodes: RolloutArrays) -> bool:
         """See :class:`varpin.core.ExplicitRollout`."""
-        q, v = (np.ascontiguousarray(part) for part in np.hsplit(self.x, 2))
-        return ExplicitRollout.start(self.scene.core, ExplicitMethod.runge_kutta, q, v).first_nodes(nodes)
+        start = ExplicitRollout.start(self.scene.core, ExplicitMethod.runge_kutta, *np.hsplit(self.x, 2))
+        return start.first_nodes(nodes)
 
     def roll(
         self,

@@ -34,47 +34,41 @@ def integrator_of(text: str) -> Integrator:
     Raises:
         InputError: The text has another form, the integrator or an option is unknown, or a value is out of its range.
     """
-    form = "a name, or a name with options such as Gauss(stages=3)"
     try:
-        node = ast.parse(text.strip(), mode="eval").body
-        match node:
-            case ast.Name(id=name):
-                values, named = [], {}
-            case ast.Call(func=ast.Name(id=name), args=args, keywords=keywords):
-                values = [_value(argument) for argument in args]
-                named = {str(keyword.arg): _value(keyword.value) for keyword in keywords}
-            case _:
-                raise InputError(f"an integrator is written as {form}, got {text!r}")
+        found = _value(ast.parse(text.strip(), mode="eval").body)
     except (SyntaxError, RecursionError, MemoryError):
-        raise InputError(f"an integrator is written as {form}, got {text!r}") from None
-    if name not in BY_NAME:
-        raise InputError(f"varpin has no integrator {name!r}; it has {', '.join(BY_NAME)}")
-    made: Integrator = _made(BY_NAME[name], values, named, text)
+        found = None
+    made = _made(found, [], {}) if isinstance(found, str) else found
+    if not isinstance(made, Integrator):
+        form = "a name, or a name with options such as Gauss(stages=3)"
+        raise InputError(f"an integrator is written as {form}, got {text!r}")
     return made
 
 
-def _made(kind: type[Any], values: list[Any], named: dict[str, Any], text: str) -> Any:
-    """The object of a class with options."""
+def _value(node: ast.expr) -> Any:
+    """The value of an expression: a number, None, a word with or without quotes, an integrator or a guard."""
+    match node:
+        case ast.Name(id=name):
+            return name
+        case ast.Call(func=ast.Name(id=name), args=args, keywords=keywords):
+            return _made(name, list(map(_value, args)), {str(own.arg): _value(own.value) for own in keywords})
+    try:
+        return ast.literal_eval(node)
+    except ValueError:
+        raise InputError(f"options of an integrator are numbers and words, got {ast.unparse(node)!r}") from None
+
+
+def _made(name: str, values: list[Any], named: dict[str, Any]) -> Any:
+    """The object of a class by its name, with options."""
+    kind: Any = Guard if name == Guard.__name__ else BY_NAME.get(name)
+    if kind is None:
+        raise InputError(f"varpin has no integrator {name!r}; it has {', '.join(BY_NAME)}")
     try:
         return kind(*values, **named)
     except TypeError:
         known = ", ".join(item.name for item in fields(kind)) or "none"
         given = ", ".join([*map(repr, values), *map(repr, named)])
-        raise InputError(f"options of {kind.__name__} are {known}, not {given}: {text!r}") from None
-
-
-def _value(node: ast.expr) -> Any:
-    """The value of an option: a number, None, a word with or without quotes, or a guard."""
-    match node:
-        case ast.Name(id=name):
-            return name
-        case ast.Call(func=ast.Name(id="Guard"), args=[], keywords=keywords):
-            given = {str(keyword.arg): _value(keyword.value) for keyword in keywords}
-            return _made(Guard, [], given, ast.unparse(node))
-    try:
-        return ast.literal_eval(node)
-    except ValueError:
-        raise InputError(f"options of an integrator are numbers and words, got {ast.unparse(node)!r}") from None
+        raise InputError(f"options of {name} are {known}, not {given}") from None
 
 
 def require_motion(scene: Scene, trajectory: Trajectory) -> None:

@@ -18,7 +18,7 @@ from varpin.core import (
     Steps,
     filter_variational,
 )
-from varpin.core.arrays import Commands, FilterArrays, FilterLog, RolloutArrays
+from varpin.core.arrays import FilterArrays, FilterLog, RolloutArrays
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
     Integrator,
@@ -145,8 +145,7 @@ class Variational(Integrator):
             raise InputError(f"{self} keeps no constraints")
         if scene.processes and self.left < 1.0:
             raise InputError("kick='split' does not go with constraints: take kick='left' or kick='held'")
-        noise = scene.noise.diffusion
-        if noise is not None and noise.control[:, :, scene.prescribed].any():
+        if scene.noise.arrays.control[:, :, scene.prescribed].any():
             raise InputError(
                 "ControlNoise is proportional to forces, and the control of a KinematicInput is a position: its "
                 "intensity (n, k, m) must be 0 there"
@@ -177,12 +176,7 @@ class Variational(Integrator):
         rollout = Rollout(*method, len(q0), self.holds_noise, places)
         if not rollout.begin(q0, v0):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
-        return Run(rollout, q0.copy(), bool(scene.inputs))
-
-    def _first(self, run: Run, nodes: RolloutArrays) -> bool:
-        nodes.q[:, 0], nodes.p[:, 0], nodes.v[:, 0], nodes.energy[:, 0] = run.paths.nodes()
-        nodes.done[:] = 1
-        return True
+        return Run(rollout, len(q0), bool(scene.inputs))
 
     def fork(self, state: Run) -> Run:
         return replace(state, paths=state.paths.fork(self._guards(self.guard, energy=not state.driven)))
@@ -192,18 +186,6 @@ class Variational(Integrator):
         if not scene.constraints:
             return found
         return [_constrained(scene, paths, i, segment) for i, segment in enumerate(found)]
-
-    def _state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
-        q, p, v, _ = state.paths.nodes()
-        return q[0], p[0], v[0]
-
-    def kicked(
-        self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
-    ) -> Segment:
-        if impulse is not None and scene.constraints and not self.holds_noise:
-            state.paths.kick(impulse[None])
-            impulse = None
-        return super().kicked(scene, state, command, drift, impulse, dt)
 
     def linearize(
         self, scene: Scene, trajectory: Trajectory, *, ramps: bool = False
@@ -269,7 +251,7 @@ class Variational(Integrator):
         rates, cubic = _rates(scene, trajectory)
         wide = 3 * n + len(cubic)
         steps, places = self._steps(scene, trajectory), self._places(scene)
-        M, _ = scene.core.jets(np.ascontiguousarray(trajectory.q[:-1]), np.ascontiguousarray(trajectory.v[:-1]))
+        M, _ = scene.core.jets(trajectory.q[:-1], trajectory.v[:-1])
         S = np.zeros((N, wide, wide))
         S[:] = np.eye(wide)
         S[:, n : 2 * n, n : 2 * n] = M
@@ -301,7 +283,7 @@ class Variational(Integrator):
             raise InputError("second derivatives are not there for a scene with a CustomForce")
         if scene.constraints:
             return self._contract_by_differences(scene, trajectory, z)
-        H, outcome, done = Steps(**self._steps(scene, trajectory)).curvatures(np.ascontiguousarray(z))
+        H, outcome, done = Steps(**self._steps(scene, trajectory)).curvatures(z)
         _require_solved(trajectory, outcome, done)
         return H
 
@@ -338,7 +320,7 @@ class Variational(Integrator):
             # impulses, and their roots must lie on the branch that is connected to dt -> 0.
             "guards": self._guards(self.guard if trajectory.noisy else None, energy=False),
             "dt": float(trajectory.dt),
-            **{name: np.ascontiguousarray(array) for name, array in arrays.items()},
+            **arrays,
         }
 
     def _guess(self, trajectory: Trajectory) -> Floats:
@@ -372,8 +354,8 @@ def _rates(scene: Scene, trajectory: Trajectory) -> tuple[Floats, list[int]]:
 
 def _along(scene: Scene, q: Floats) -> Floats:
     """Projection 1 - C' (C M^-1 C')^-1 C M^-1 (N, n, n) of impulses onto the constraints at configurations (N, n)."""
-    M = scene.core.jets(np.ascontiguousarray(q), np.zeros_like(q))[0]
-    C = scene.core.constraints(np.ascontiguousarray(q))[2]
+    M, _ = scene.core.jets(q, np.zeros_like(q))
+    C = scene.core.constraints(q)[2]
     eased = np.linalg.solve(M, C.transpose(0, 2, 1))
     found: Floats = np.eye(q.shape[1]) - C.transpose(0, 2, 1) @ np.linalg.pinv(C @ eased, rcond=1e-9) @ eased.transpose(
         0, 2, 1

@@ -10,15 +10,18 @@ velocity, which only :class:`CustomNoise` allows, the strong order is 1/2.
 from __future__ import annotations
 
 import math
+import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats, Integers
+from varpin.core import Mechanism
 from varpin.core.arrays import Diffusion
 from varpin.errors import InputError
 from varpin.support.checks import (
@@ -35,6 +38,9 @@ from varpin.support.checks import (
 )
 from varpin.support.differences import slopes
 from varpin.support.frozen import Frozen
+
+if TYPE_CHECKING:
+    from varpin.mechanics.scene import Scene
 
 
 class NoiseFieldError(InputError):
@@ -137,6 +143,44 @@ class BoundNoise(Frozen):
                 if getattr(noise, name) is not None and values is not None:
                     values[:, :, columns] = noise.at(name, points, values[0, :, columns].shape)
         return Fields(F, Fq, Fv, Fu)
+
+
+def ito_drift(core: Mechanism, q: Floats, v: Floats, fields: Fields) -> Floats:
+    """The Ito correction (N, n) of fields at (q, v) (N, n): the drift from Stratonovich to Ito [N m or N].
+
+    It is (1/2) sum_i (dF_i/dv) M^-1 F_i, equation (N1) and (1.3) of the paper; zero where no field depends on v.
+    """
+    if fields.Fv is None:
+        return np.zeros_like(q)
+    drift: Floats = 0.5 * np.einsum("Nikj,Njk->Ni", fields.Fv, np.linalg.solve(core.jets(q, v)[0], fields.F))
+    return drift
+
+
+class StepNoise:
+    """The noise of a scene's steps where fields are in Python, in the form that the core calls."""
+
+    def __init__(self, scene: Scene) -> None:
+        # The scene owns this object, which would be a cycle for good.
+        self._scene = weakref.proxy(scene)
+
+    def __call__(
+        self, q: Floats, v: Floats, center: Floats, u: Floats, change: Floats, dw: Floats
+    ) -> tuple[Floats, Floats]:
+        """The impulse (n,) of increments (K,), (0,) for none, and the drift (n,), (0,) if no field depends on v.
+
+        They are at the state q, v (n,), with ``center`` (n, k) for this motion, the mean control u (m,) over the step
+        and its change (m,), (0,) where the noise does not see it.
+        """
+        scene, ends = self._scene, None
+        if change.size:
+            # A kinematic input is where it is at the end of the step.
+            u[scene.prescribed] += 0.5 * change[scene.prescribed]
+            change[scene.prescribed] = 0.0
+            ends = (u - 0.5 * change)[None], (u + 0.5 * change)[None]
+        noise = scene.noise.changed(arrays=scene.noise.arrays._replace(center=center))
+        fields = over_steps(noise, q[None], v[None], u[None], ends, q)
+        drift = np.zeros(0) if fields.Fv is None else ito_drift(scene.core, q[None], v[None], fields)[0]
+        return fields.F[0, :, : dw.size] @ dw, drift
 
 
 def over_steps(
@@ -250,7 +294,7 @@ Field = Callable[[Floats, Floats, Floats], ArrayLike]
 
 @dataclass(frozen=True, eq=False)
 class CustomNoise(Noise):
-    """A diffusion field that you write in Python. Motions with it run in Python, not in compiled code.
+    """A diffusion field that you write in Python; steps call it once, or twice with ``kick="split"``.
 
     Attributes:
         field: Function of (q (n,), v (n,), u (m,)) that returns F (n, k) [N m s^0.5 or N s^0.5].

@@ -18,6 +18,7 @@ from varpin.mechanics.scene import Scene
 from varpin.model import Robot, combine
 from varpin.model.loading import hold_joints
 from varpin.support.checks import JointValues, as_floats, joint_array, tuple_of
+from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
 
 # Share of the largest torque of gravity that is rounding.
@@ -25,7 +26,7 @@ _ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
-class Required:
+class Required(Frozen):
     """Report on the parts of a scene that are computed and those that are left out.
 
     Attributes:

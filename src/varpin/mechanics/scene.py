@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats, Integers
 from varpin.core import Mechanism
-from varpin.core.arrays import Coupling, Diffusion, Element
+from varpin.core.arrays import Coupling, Element
 from varpin.errors import InputError
 from varpin.finding import Told
 from varpin.mechanics.arguments import acting_forces, driven, given_constraints, gravity_of, is_input
@@ -32,7 +32,7 @@ from varpin.mechanics.forces import (
     keeps_energy,
     of_kind,
 )
-from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, bind, models_of
+from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, StepNoise, bind, models_of
 from varpin.mechanics.values import values_of
 from varpin.model import Robot, require_robot
 from varpin.model.tree import block_ends, mechanism, path_coordinates
@@ -416,8 +416,8 @@ class Scene(Frozen):
 
     @cached_property
     def core(self) -> Mechanism:
-        """The scene in the compiled core, without noise fields that only Python can evaluate."""
-        rows = self.bound_constraints.rows
+        """The scene in the compiled core."""
+        rows, noise = self.bound_constraints.rows, self.noise
         tree = self.robot.tree._replace(
             **(self._constrained_tree() if self.constraints else {}),
             group=self.group,
@@ -440,7 +440,8 @@ class Scene(Frozen):
             ),
             custom=None if self.custom is None else weakref.proxy(self.custom),
             actuation=self.actuation,
-            diffusion=self.diffusion,
+            diffusion=noise.arrays,
+            noise=(weakref.proxy(self.step_noise), noise.sloped, noise.velocity_dependent) if noise.own else None,
         )
 
     def _constrained_tree(self) -> dict[str, Any]:
@@ -476,9 +477,9 @@ class Scene(Frozen):
         return bounds
 
     @cached_property
-    def diffusion(self) -> Diffusion:
-        """The noise fields that the core can evaluate; empty if some need Python."""
-        return self.noise.diffusion or bind((), self.actuation, ()).arrays
+    def step_noise(self) -> StepNoise:
+        """The noise of a step, where fields are in Python."""
+        return StepNoise(self)
 
     @cached_property
     def values(self) -> Mapping[str, Floats]:
@@ -494,7 +495,7 @@ class Scene(Frozen):
     def silence(self) -> Floats:
         """Wiener increments (0, 0, k) of a rollout without noise."""
         # Not read-only, which has nothing to protect here and makes each call of the core longer.
-        return np.zeros((0, 0, self.diffusion.constant.shape[1]))
+        return np.zeros((0, 0, self.processes))
 
     @cached_property
     def no_drift(self) -> Floats:

@@ -95,7 +95,8 @@ class Robot(Frozen):
 
     def _repr_html_(self) -> str:
         lower, upper = self.position_limits
-        columns = zip(self.joint_names, lower, upper, self.velocity_limit, self.effort_limit, strict=True)
+        columns = {"lower [rad or m]": lower, "upper": upper}
+        columns |= {"velocity [1/s]": self.velocity_limit, "torque [N m or N]": self.effort_limit}
         tied = (self.model.names[tie.follower] for tie in self.ties)
         loops = (f"{a} on {b}" for a, b in self.loops)
         rows: list[tuple[str, object]] = [
@@ -106,10 +107,7 @@ class Robot(Frozen):
             ("loops for a scene to close", markup.listed(loops)),
             ("end effector", self.end_effector),
         ]
-        head = ("joint", "lower [rad or m]", "upper", "velocity [1/s]", "torque [N m or N]")
-        return markup.facts(
-            f"Robot {self.name}", rows, markup.table(head, [(name, *map(float, row)) for name, *row in columns])
-        )
+        return markup.facts(f"Robot {self.name}", rows, markup.joint_table(self.joint_names, columns))
 
     def rebuilt(self, **changes: Any) -> Robot:
         """The robot with its model rebuilt; see :func:`varpin.model.mimic.rebuild`."""

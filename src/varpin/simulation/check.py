@@ -174,7 +174,7 @@ def repeated(
     q[0], v[0] = trajectory.q[0], trajectory.v[0]
     commands = _commands(scene, integrator, method, trajectory, controls, parts)
     drawn, kicks = _noise(scene, integrator, method, trajectory, parts)
-    drift = scene.no_drift
+    drift = None
     if scene.noise.velocity_dependent:
         drift = method.drift_share * np.repeat(drifts(scene, trajectory), parts, axis=0)[None]
     try:
@@ -198,14 +198,14 @@ def repeated(
         else:
             before = last.u[None, -1] if first else None
             block = rows(commands, first // commands.hold, -(-taken.stop // commands.hold), before)
-        (last,) = method.rollout_compiled(
+        (last,) = method.rollout(
             scene,
             state,
             block,
-            np.ascontiguousarray(drawn[:, taken]) if len(drawn) else drawn,
-            np.ascontiguousarray(drift[:, taken]) if len(drift) else drift,
+            drawn[:, taken],
             trajectory.dt / parts,
-            None if kicks is None else np.ascontiguousarray(kicks[:, taken]),
+            drift=None if drift is None else drift[:, taken],
+            impulses=None if kicks is None else kicks[:, taken],
         )
         new = len(last.q) // parts
         for nodes, values in ((q, last.q), (v, last.v)):
@@ -252,9 +252,7 @@ def noise_unknown(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
         return False
     if scene.noise.velocity_dependent and integrator.kick == "split":
         return True
-    if not scene.constraints:
-        return False
-    return scene.noise.diffusion is None or trajectory.dw.shape[1] > scene.processes
+    return bool(scene.constraints and trajectory.dw.shape[1] > scene.processes)
 
 
 def _noise(
@@ -388,7 +386,7 @@ def short_forces(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
         at, rate = q[k] + along[:, 1:4] @ ends, along[:, 5:] @ ends
         found = np.array([force(*state, False)[0] for state in zip(at, rate, strict=True)])
         missed[k] = dt * (0.5 * weights @ found[len(times) :] - shares(times) @ found[: len(times)])
-    speeds = np.abs(np.linalg.solve(scene.core.jets(q[:-1].copy(), v[:-1].copy())[0], missed[:, :, None])[:, :, 0])
+    speeds = np.abs(np.linalg.solve(scene.core.jets(q[:-1], v[:-1])[0], missed[:, :, None])[:, :, 0])
     off = speeds * (trajectory.t[-1] - trajectory.t[:-1, None]) / travel_scales(scene, q)
     step, joint = divmod(int(off.argmax()), off.shape[1])
     if not off[step, joint] > TOLD:

@@ -29,7 +29,6 @@ _SLOWEST = 1e-6
 
 def masses(scene: Scene, q: Floats) -> Floats:
     """M (K, n, n) at configurations (K, n)."""
-    q = np.ascontiguousarray(q)
     return scene.core.jets(q, np.zeros_like(q))[0]
 
 
@@ -38,8 +37,7 @@ def damping_matrices(scene: Scene, q: Floats, v: Floats, forces: Floats, *, cust
 
     At states q, v (K, n) under constant forces (K, n); symmetric.
     """
-    q, v = np.ascontiguousarray(q), np.ascontiguousarray(v)
-    dampers = -np.minimum(scene.core.forces(q, v, np.ascontiguousarray(forces))[2], 0.0)
+    dampers = -np.minimum(scene.core.forces(q, v, forces)[2], 0.0)
     D: Floats = dampers[:, :, None] * np.eye(q.shape[1])
     if scene.couplings or (custom and scene.custom is not None):
         slopes = scene.core.coupled_forces(q, v)[2]
@@ -71,9 +69,9 @@ def fastest_damping(scene: Scene, q: Floats, v: Floats, forces: Floats, least: f
 
 def pulls_fast(scene: Scene, q: Floats, forces: Floats, dt: float) -> bool:
     """Whether springs, servos or gravity advance a mode by more than a radian in ``dt`` [s], at rest at q (K, n)."""
-    q, still = np.ascontiguousarray(q), np.zeros_like(q)
+    still = np.zeros_like(q)
     K = np.array([scene.core.jet(x, still[0])[3] for x in q])
-    K += scene.core.forces(q, still, np.ascontiguousarray(forces))[1][:, :, None] * np.eye(q.shape[1])
+    K += scene.core.forces(q, still, forces)[1][:, :, None] * np.eye(q.shape[1])
     if scene.couplings:
         slopes = scene.core.coupled_forces(q, still)[1]
         K += 0.5 * (slopes + np.swapaxes(slopes, 1, 2))

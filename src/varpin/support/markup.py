@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+
+from varpin.arrays import Floats
 
 # Largest number of rows of a table, and of names in a list.
 _MOST = 50
@@ -43,6 +45,12 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[object]], strong: Iter
     if len(every) > _MOST:
         body += f'<tr><td colspan="{len(columns)}" style="{_LEFT}">and {len(every) - _MOST} more</td></tr>'
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def joint_table(joints: Sequence[str], columns: Mapping[str, Floats]) -> str:
+    """A table with a row for each joint, of numbers (n,) under their headings."""
+    numbers = (column.tolist() for column in columns.values())
+    return table(("joint", *columns), zip(joints, *numbers, strict=True))
 
 
 def folded(title: str, part: str) -> str:

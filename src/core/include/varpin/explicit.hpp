@@ -253,11 +253,13 @@ class ExplicitRollout {
     // One step of a path, with its node. `dynamics` is at the path's state before and after.
     Outcome step(double h, const StepInputs& in, const Nodes& nodes) {
         const bool beside = method_ == ExplicitMethod::euler;
-        stage_forces(*mechanism_, in.drift, in.within ? in.within : in.u, in.within ? stepper_.abscissae() : 1,
+        const double *q = stepper_.q.data(), *v = stepper_.v.data();
+        const double* drift = read_noise(*mechanism_, 1.0, q, v, center(in.path), in, own_);
+        stage_forces(*mechanism_, drift, in.within ? in.within : in.u, in.within ? stepper_.abscissae() : 1,
                      force_.data());
         if (in.impulses) kick(in.impulses);
         if (in.increments) {
-            noise_impulse(*mechanism_, 1.0, stepper_.q.data(), center(in.path), in.felt, in.increments, jump_.data());
+            noise_impulse(*mechanism_, 1.0, q, center(in.path), in.felt, in.increments, own_, jump_.data());
             stepper_.dynamics.solve_mass(jump_.data(), jump_.data());
             if (!beside) {
                 add_jump();
@@ -298,6 +300,7 @@ class ExplicitRollout {
     std::vector<double> center_ = zeros(paths_ * dof(), mechanism_->diffusion.processes);  // of the diffusion fields
     ExplicitStepper stepper_;
     std::vector<double> force_ = zeros(stepper_.abscissae(), dof()), jump_ = zeros(dof());
+    StepNoise own_;  // where Python has it
     PathDriver driver_;
 };
 

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <algorithm>
+#include <functional>
 #include <vector>
 
 #include "varpin/constraints.hpp"
@@ -10,6 +11,11 @@
 #include "varpin/tree.hpp"
 
 namespace varpin {
+
+// The impulse of the noise of a step at a state (n), and its drift (n), (N1), empty if no field depends on v.
+struct StepNoise {
+    std::vector<double> impulse, drift;
+};
 
 // Diffusion fields F_i of k Wiener processes, entry by entry
 // F = constant + control u + quadratic (q - center)^2; a center of NaN is the initial q of a rollout.
@@ -20,6 +26,12 @@ struct Diffusion {
     std::vector<double> quadratic;  // (n, k)
     std::vector<double> center;     // (n, k) [rad or m]
     std::vector<int> sloped{};      // the processes whose strength depends on the control
+    // Where functions of a user are among the fields, all of them at (q, v), for these centers, the mean of the control
+    // over the step, its change and the increments, or null; and whether a field depends on v.
+    std::function<void(const double* q, const double* v, const double* center, const double* mean, const double* change,
+                       const double* increments, StepNoise&)>
+        outer{};
+    bool by_velocity = false;
 };
 
 // A nonzero entry of B, generalized force per unit of a control.

@@ -94,9 +94,9 @@ struct Felt {
     const double* change = nullptr;  // (m) from its start to its end, or null where the noise does not see it
 };
 
-// The controls of step s of a path that its noise sees, after apply_policy. Those of linear controls are written to
-// `work`.
-inline Felt felt_controls(const Commands& commands, std::ptrdiff_t path, std::ptrdiff_t s, const double* u,
+// The controls of step s of a path that its noise sees, after apply_policy, with the change of linear ones if `sloped`.
+// Those of linear controls are written to `work`.
+inline Felt felt_controls(const Commands& commands, std::ptrdiff_t path, std::ptrdiff_t s, bool sloped, const double* u,
                           std::vector<double>& work) {
     const int m = commands.controls;
     const double* to = u + s * m;
@@ -109,7 +109,7 @@ inline Felt felt_controls(const Commands& commands, std::ptrdiff_t path, std::pt
         work[c] = (1.0 - share) * from[c] + share * to[c];
         work[m + c] = (to[c] - from[c]) / commands.hold;
     }
-    return {work.data(), commands.sloped ? work.data() + m : nullptr};
+    return {work.data(), sloped ? work.data() + m : nullptr};
 }
 
 // The force drift + B u of a step with constant controls; drift (n) may be null.
@@ -143,9 +143,13 @@ inline void add_slope_noise(const Mechanism& mechanism, double part, const doubl
 
 // The impulse part * sum_i F_i(q, u) dw_i, and that of the slopes of linear controls.
 inline void noise_impulse(const Mechanism& mechanism, double part, const double* q, const double* center,
-                          const Felt& felt, const double* increments, double* impulse) {
+                          const Felt& felt, const double* increments, const StepNoise& own, double* impulse) {
     const Diffusion& fields = mechanism.diffusion;
     const int n = mechanism.dof(), m = mechanism.controls, k = fields.processes;
+    if (fields.outer) {
+        for (int i = 0; i < n; ++i) impulse[i] = part * own.impulse[i];
+        return;
+    }
     for (int i = 0; i < n; ++i) {
         double total = 0.0;
         for (int w = 0; w < k; ++w) {
@@ -174,11 +178,11 @@ struct Extra {
 // addition to it; `increments` and `impulses` may be null. `sum` (n) is work space.
 inline Extra held_noise(const Mechanism& mechanism, double h, const double* drift, const double* impulses,
                         const double* q, const double* center, const Felt& felt, const double* increments,
-                        double* sum) {
+                        const StepNoise& own, double* sum) {
     if (!increments && !impulses) return {drift, nullptr};
     const int n = mechanism.dof();
     if (increments) {
-        noise_impulse(mechanism, 1.0 / h, q, center, felt, increments, sum);
+        noise_impulse(mechanism, 1.0 / h, q, center, felt, increments, own, sum);
     } else {
         std::fill(sum, sum + n, 0.0);
     }
@@ -205,7 +209,7 @@ inline void diffusion_centers(const Mechanism& mechanism, const double* q, doubl
 // What acts on P paths over N steps in addition to their commands; each may be null.
 struct Additions {
     const double* increments = nullptr;  // (P, N, K) of the Wiener processes, K = increments_of_step
-    const double* drift = nullptr;       // (P, N, n) a force
+    const double* drift = nullptr;       // (P, N, n) a force, instead of the drift of the noise
     const double* impulses = nullptr;    // (P, N, 2, n) before and after each step
 };
 
@@ -214,11 +218,20 @@ struct StepInputs {
     std::int64_t path = 0, step = 0, row = 0;  // row = path N + step, of arrays (P, N, ...)
     const double* u = nullptr;                 // (m)
     const double* within = nullptr;            // (s, m) at the stages
-    Felt felt;
-    const double* increments = nullptr;  // (K)
-    const double* drift = nullptr;       // (n)
-    const double* impulses = nullptr;    // (2, n)
+    Felt felt;                                 // empty without noise
+    const double* increments = nullptr;        // (K)
+    const double* drift = nullptr;             // (n)
+    const double* impulses = nullptr;          // (2, n)
 };
+
+// Read the noise of a step at a state, if Python has it; returns the drift of the step, `share` of that of the noise.
+inline const double* read_noise(const Mechanism& mechanism, double share, const double* q, const double* v,
+                                const double* center, const StepInputs& in, StepNoise& own) {
+    if (!in.felt.mean || !mechanism.diffusion.outer) return in.drift;
+    mechanism.diffusion.outer(q, v, center, in.felt.mean, in.felt.change, in.increments, own);
+    for (double& entry : own.drift) entry *= share;
+    return in.drift || own.drift.empty() ? in.drift : own.drift.data();
+}
 
 // How a path begins: whether it can, and its state, which commands see.
 struct Entry {
@@ -236,6 +249,8 @@ class PathDriver {
               const Nodes& nodes, const Begin& begin, const Take& take) {
         const int n = mechanism.dof(), m = mechanism.controls;
         const std::int64_t width = increments_of_step(mechanism, commands);
+        const bool sloped = commands.sloped || !more.increments;
+        const bool noisy = more.increments || (mechanism.diffusion.by_velocity && !more.drift);
         for (std::int64_t path = 0; path < nodes.paths; ++path) {
             double* u = nodes.u + path * nodes.steps * m;
             auto [outcome, first, second] = begin(path);
@@ -244,7 +259,7 @@ class PathDriver {
                 const std::int64_t row = path * nodes.steps + s;
                 apply_policy(commands, path, s, n, first, second, u);
                 const double* within = stage_controls(commands, path, s, stages, u, line_);
-                const Felt felt = more.increments ? felt_controls(commands, path, s, u, seen_) : Felt{};
+                const Felt felt = noisy ? felt_controls(commands, path, s, sloped, u, seen_) : Felt{};
                 outcome = take({path, s, row, u + s * m, within, felt, row_of(more.increments, row, width),
                                 row_of(more.drift, row, n), row_of(more.impulses, row, 2 * n)});
                 if (outcome == Outcome::solved) nodes.done[path] = s + 1;

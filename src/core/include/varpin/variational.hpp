@@ -335,6 +335,7 @@ class VariationalStepper {
     std::vector<double> guess = zeros(stages, n);  // extrapolated stage velocities
     std::vector<double> bend = zeros(2, n);
     std::vector<double> extras = zeros(n);  // forces in addition to the controls
+    StepNoise own;                          // where Python has it
 
     // The force on coordinate c, without those of elements, if it is constant over the step.
     double constant(int c) const { return outer ? force[c] + outer[c] : force[c]; }
@@ -453,10 +454,12 @@ class VariationalStepper {
     Outcome noisy_step(double h, int hold, const StepInputs& in, PathState& state, const Nodes& nodes) {
         const bool kicks = in.increments && !held;
         const double* const pushes = held ? nullptr : in.impulses;
+        const double* drift = read_noise(in, state);
         if (kicks) noise_kick(left, in.felt, in.increments, state);
         if (pushes) kick(pushes, state);
-        const Extra extra = held_noise(mechanism, h, in.drift, held ? in.impulses : nullptr, state.q.data(),
-                                       state.center.data(), in.felt, held ? in.increments : nullptr, extras.data());
+        const Extra extra =
+            held_noise(mechanism, h, drift, held ? in.impulses : nullptr, state.q.data(), state.center.data(), in.felt,
+                       held ? in.increments : nullptr, own, extras.data());
         outer = extra.external;
         stride = in.within ? n : 0;
         constant_force(mechanism, extra.driven, in.u, force.data());
@@ -467,15 +470,23 @@ class VariationalStepper {
         if (outcome != Outcome::solved) return outcome;
         state.halvings.insert(state.halvings.end(), halvings.begin(), halvings.end());
         state.impulses.insert(state.impulses.end(), state.impulse.begin(), state.impulse.end());
-        if (kicks && left < 1.0) noise_kick(1.0 - left, in.felt, in.increments, state);
+        if (kicks && left < 1.0) {
+            read_noise(in, state);
+            noise_kick(1.0 - left, in.felt, in.increments, state);
+        }
         if (pushes) kick(pushes + n, state);
         record_node(state, n, nodes, in.row);
         return outcome;
     }
 
+    const double* read_noise(const StepInputs& in, PathState& state) {
+        const double share = 1.0 - 2.0 * left * (1.0 - left);
+        return varpin::read_noise(mechanism, share, state.q.data(), state.v.data(), state.center.data(), in, own);
+    }
+
     // The impulse of `part` of the increments dw, (N2).
     void noise_kick(double part, const Felt& felt, const double* dw, PathState& state) {
-        noise_impulse(mechanism, part, state.q.data(), state.center.data(), felt, dw, bend.data());
+        noise_impulse(mechanism, part, state.q.data(), state.center.data(), felt, dw, own, bend.data());
         kick(bend.data(), state);
     }
 };
