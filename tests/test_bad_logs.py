@@ -1,48 +1,24 @@
 """Logs as they come from arms, with what is wrong with them: one clear error, a warning that fits, or right values."""
 
-import functools
-
 import numpy as np
 import pytest
 from refusals import naming, refused
+from ur5_logs import NAMES, NOISE, TRUTH, motion, start
 
 import varpin as vp
 
-NOISE = 2e-4
-TRUTH = np.array([2.0, 1.5, 1.0, 0.3, 0.2, 0.1, 2.0])
-NAMES = ["damping", "payload"]
-MIDDLE = np.array([0.0, -1.2, 1.2, -0.5, 0.5, 0.0])
 ORDER = [2, 1, 0, 3, 4, 5]  # as joint states come by name, the elbow first
 
 
-def start():
-    return vp.Scene(vp.load_robot("ur5"), damping=0.0)
-
-
-@functools.cache
 def measured(late=0):
-    """Times, positions with noise and torques of a UR5 whose torques act ``late`` ms later than they are told."""
-    scene = vp.Scene(vp.load_robot("ur5", payload=vp.Payload("tool0", 2.0)), damping=TRUTH[:6])
-    rng, N = np.random.default_rng(3), 150
-    phase, rate, size = rng.uniform(0, 6, (3, 6)), rng.uniform(0.3, 1.5, (3, 6)), rng.uniform(0.1, 0.2, (3, 6))
-
-    def law(t, q, v):
-        goal = MIDDLE + np.sum(size / rate * (np.sin(2.0 * np.pi * rate * t + phase) - np.sin(phase)), axis=0)
-        M = scene.core.jets(q[None], v[None])[0][0]
-        return scene.holding_torque(q) + M @ (200.0 * (goal - q) - 20.0 * v) + scene.damping * v
-
-    options = {"dt": 1e-3, "steps": 10 * N, "integrator": vp.Gauss(3), "check": False}
-    motion = vp.simulate(scene, MIDDLE, np.zeros(6), controls=law, period=10, **options)
-    told = motion.u
-    if late:
-        acting = np.concatenate([np.repeat(told[:1], late, axis=0), told])[: 10 * N]
-        motion = vp.simulate(scene, MIDDLE, np.zeros(6), controls=acting, **options)
-    q = motion.q[::10] + NOISE * np.random.default_rng(0).standard_normal((N + 1, 6))
-    return motion.t[::10], q, told[np.r_[0 : 10 * N : 10, -1]]
+    """Times, positions with noise and torques that act ``late`` ms later than they are told."""
+    q, u = motion(late, duration=1.5)
+    return 1e-2 * np.arange(len(q)), q + NOISE * np.random.default_rng(0).standard_normal(q.shape), u
 
 
 def found(t, q, u, joints=None, **options):
-    return vp.identify(start(), vp.Log(t, q, u, joints=joints), NAMES, q_noise=NOISE, **options)
+    log = vp.Log(t, q, u, joints=joints, controls=start().robot.joint_names)
+    return vp.identify(start(), log, NAMES, q_noise=NOISE, **options)
 
 
 def off(each):
@@ -61,6 +37,7 @@ REFUSED = {
     "a dead encoder": (lambda t, q, u: (t, spoiled(q, np.s_[:, 3], 0.0), u), ("'wrist_1_joint'", "encoder")),
     "a dead encoder's gaps": (lambda t, q, u: (t, spoiled(q, np.s_[:, 3], np.nan), u), ("'wrist_1_joint'", "samples")),
     "gaps in the controls": (lambda t, q, u: (t, q, spoiled(u, (50, 2), np.nan)), ("u[50, 2]", "nan")),
+    "degrees": (lambda t, q, u: (t, np.degrees(q) + 360.0, u), ("q of", "degrees")),
     "rows out of order": (lambda t, q, u: (spoiled(t, 50, 0.2), q, u), ("t[50]", "sort")),
 }
 
@@ -74,9 +51,9 @@ def test_what_no_value_could_be_right_from_is_refused(what):
 
 WARNED = {
     "a clock that is fast by 1 %": (lambda t, q, u: (1.01 * t, q, u), ("clock", "q_noise")),
+    "an encoder with its sign turned": (lambda t, q, u: (t, q * [1, 1, -1, 1, 1, 1], u), ("column", "q_noise")),
     "columns in another order": (lambda t, q, u: (t, q[:, ORDER], u[:, ORDER]), ("column", "q_noise")),
     "an encoder that dies": (lambda t, q, u: (t, spoiled(q, np.s_[70:, 3], q[70, 3]), u), ("q_noise",)),
-    "an encoder with its sign turned": (lambda t, q, u: (t, q * [1, 1, -1, 1, 1, 1], u), ("column", "q_noise")),
 }
 
 
@@ -91,13 +68,34 @@ def test_what_does_not_fit_is_told_first(what):
     assert np.abs(each.values / TRUTH - 1.0).max() > 0.02
 
 
+TURNED = {
+    # What it carries would hide that of the first wrist joint.
+    "torques of all joints": ([0, 1, 2, 4, 5], lambda t, q, u: vp.Log(t, q, -u)),
+    "torques of a joint": ([0], lambda t, q, u: vp.Log(t, q, u * [-1, 1, 1, 1, 1, 1])),
+    "torques of another": ([5], lambda t, q, u: vp.Log(t, q, u * [1, 1, 1, 1, 1, -1])),
+    "an encoder": ([2], lambda t, q, u: vp.Log(t, q * [1, 1, -1, 1, 1, 1], u)),
+    "none": ([], vp.Log),
+    "none, but friction": ([], lambda t, q, u: vp.Log(t, q, u + 9.0 * np.sign(np.gradient(q, axis=0)))),
+    "none, and strong drives": ([], lambda t, q, u: vp.Log(t, q, 0.5 * u)),
+}
+
+
+@pytest.mark.parametrize("what", TURNED)
+def test_turned_signs_are_told(what):
+    joints, change = TURNED[what]
+    log = change(*measured()).matched(start())
+    told = [warning for warning in log.warnings if warning.kind == "sign of the controls"]
+    named = [k for k, name in enumerate(start().robot.joint_names) if any(name in warning for warning in told)]
+    assert named == joints
+
+
 @pytest.mark.parametrize("what", ["as it is", "named columns", "gaps", "an epoch's clock", "late torques"])
 def test_values_are_right_all_the_same(what):
     late = 8 * (what == "late torques")
     t, q, u = measured(late)
     names = tuple(start().robot.joint_names[k] for k in ORDER)
     given = {
-        "named columns": (t, q[:, ORDER], u[:, ORDER], names),
+        "named columns": (t, q[:, ORDER], u, names),
         "gaps": (t, np.where(np.random.default_rng(1).random(q.shape) < 0.1, np.nan, q), u),
         "an epoch's clock": (t + 1.7e9, q, u),
     }

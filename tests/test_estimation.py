@@ -407,6 +407,7 @@ def test_innovations_that_noise_does_not_explain_are_told(intensity, told, caplo
         scene = vp.Scene(robot, gravity=np.zeros(3), damping=0.5, noise=vp.AdditiveNoise(intensity))
         found = vp.smooth(scene, log, q_noise=ENCODER)
         assert bool(naming(found.warnings, "innovations", f"{found.nis().mean():.3g}", "2")) == told
+        assert str(found).splitlines() == [repr(found), *(f"warning: {warning}" for warning in found.warnings)]
     assert bool(caplog.messages) == told
 
 

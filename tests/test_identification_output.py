@@ -152,6 +152,7 @@ def test_an_identification_writes_its_urdf(found, tmp_path, caplog):
     assert again.model.inertias[2].mass == pytest.approx(2.6 + found.values[2], rel=1e-12)
     assert found.values[2] == pytest.approx(0.8, abs=4.0 * found.deviations[2])
     assert not caplog.messages
+    assert not unnamed(repr(found.changed(warnings=("a",))), "3 parameters", "payload:tool", "2 logs", "1 warning")
     found.changed(names=("armature:lift", *found.names[1:])).save_urdf(tmp_path / "part.urdf")
     assert not unnamed(caplog.messages[0], "part.urdf", "armature:lift")
 

@@ -148,6 +148,7 @@ def test_a_report_prints_its_tables_and_warnings():
     for link in report.links:
         assert f"\n  {link.name} " in text
     assert f"  {report.total_mass:.5g}\n" in text
+    assert f"end effector          {report.robot.end_effector}\n" in text
     for warning in report.warnings:
         assert f"warning: {warning}\n" in text + "\n"
     assert "\x1b" not in text

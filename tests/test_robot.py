@@ -365,6 +365,20 @@ def test_planar_chain_is_rods_in_the_vertical_plane():
     np.testing.assert_allclose(scene.robot.frame_positions(q), [tips[-1, 0], 0.0, tips[-1, 1]], atol=1e-14)
 
 
+def test_the_end_effector_is_no_camera_and_no_finger(tmp_path):
+    frames = (("camera", "0.05 0 0.3"), ("flange", "0 0 0.1"), ("zoom", "0 0.03 0.2"))
+    plates = [
+        f'<joint name="{name}_joint" type="fixed"><origin xyz="{at}"/><parent link="b"/><child link="{name}"/></joint>'
+        f'<link name="{name}"/>'
+        for name, at in frames
+    ]
+    parts = [link("a"), link("b"), joint("shoulder", "base", "a"), joint("wrist", "a", "b", axis="0 0 1"), *plates]
+    names = [vp.load_robot(write_urdf(tmp_path, *parts)).end_effector]
+    names += [vp.load_robot(name).end_effector for name in ("kinova", "ur5", "xarm7", "finger_edu")]
+    names += [vp.load_robot("panda", lock={"panda_finger_joint1": 0.0}).end_effector]
+    assert names == ["flange", "j2s6s200_end_effector", "tool0", "link_eef", "finger_tip_link", "panda_hand_tcp"]
+
+
 def test_frames_are_where_pinocchio_says(load):
     panda = load("panda")
     q = np.random.default_rng(0).normal(size=(2, panda.dof))
@@ -513,6 +527,8 @@ def test_armature_adds_to_the_diagonal(load, armature, added):
     own = jet(robot, q).Lvv
     np.testing.assert_allclose(own, jet(load("ur5"), q).Lvv + np.diag(added), rtol=0, atol=1e-12)
     np.testing.assert_allclose(mass_matrix(robot, q, robot.model.createData()), own, rtol=0, atol=1e-10)
+    with refused(vp.InputError, "armature", "'elbow_joint'", "-1"):
+        vp.load_robot("ur5", armature=np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0]))
 
 
 SHAPES = """

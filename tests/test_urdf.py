@@ -349,7 +349,7 @@ def test_threads_that_load_at_once_keep_stderr(tmp_path, capfd):
         ("ur55", vp.RobotNotFound, ("'ur55'", "ur5")),
         ("Panda", vp.RobotNotFound, ("'Panda'", "panda")),
         ("fingr", vp.RobotNotFound, ("'fingr'", "finger")),
-        ("talos", vp.RobotNotFound, ("'talos'", "talos_arm")),
+        ("talos", vp.RobotNotFound, ("fixed-base", "'talos'", "talos_arm")),
         ("TwoDofs", vp.RobotNotFound, ("'TwoDofs'", "asr_twodof")),
         ("a1", vp.RobotError, ("'a1'", "a1.urdf")),
         ("{}", vp.RobotError, ("{}", "folder", "made_up.urdf")),

@@ -45,7 +45,7 @@ class RobotNotFound(RobotError):
             hints = ["varpin.robot_names() lists the names, such as " + ", ".join(known[:5])]
         if more and name.lower() not in known:
             hints.append(more)
-        super().__init__("; ".join([f"no robot or URDF file {name[:100]!r}{note}", *hints]))
+        super().__init__("; ".join([f"no fixed-base robot or URDF file {name[:100]!r}{note}", *hints]))
 
 
 class UnsupportedJoint(RobotError):

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import argparse
 import logging
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from rich.console import Console
 
-from varpin.arrays import Floats
 from varpin.cli.arguments import (
     add_gravity,
     add_integrator,
@@ -26,8 +23,7 @@ from varpin.cli.arguments import (
 from varpin.cli.console import INTERRUPTED, STEP_FAILED, progress_bar, say, show
 from varpin.cli.outputs import PICTURES, add_files, files_of, save_figure, write_all
 from varpin.mechanics.scene import Scene
-from varpin.model import joint_unit, load_robot
-from varpin.support.tables import Table
+from varpin.model import load_robot
 
 if TYPE_CHECKING:
     from varpin.estimation import Identification
@@ -92,9 +88,9 @@ def _identify(request: argparse.Namespace, errors: Console) -> int:
             )
         written, trouble = write_all(request, errors, files, found)
     if not request.quiet:
-        show(_values(found))
-        show(_residuals(found))
-        show(_facts(found, written))
+        show(found)
+        for row in written:
+            show("{}: {}".format(*row))
     if found.status == "converged":
         return trouble
     say(errors, f"the search has not converged: {found.status}", style="yellow")
@@ -115,42 +111,3 @@ def _plot(path: Path, found: Identification) -> None:
     from varpin.show.plots import plot_identification  # noqa: PLC0415 - matplotlib is slow to import
 
     save_figure(path, plot_identification(found)[0])
-
-
-def _values(found: Identification) -> Table:
-    rows = [
-        (name, f"{start:.5g}", f"{value:.5g}", f"{deviation:.2g}" if np.isfinite(deviation) else "not told", unit)
-        for name, start, value, deviation, unit in zip(
-            found.names, found.start, found.values, found.deviations, found.units, strict=True
-        )
-    ]
-    return Table(found.scene.robot.name, ("parameter", "before", "value", "+-", "unit"), rows)
-
-
-def _residuals(found: Identification) -> Table:
-    """The root mean square of each joint's residuals."""
-    robot = found.scene.robot
-    before = [log.q - own for log, own in zip(found.logs, found.predicted_before, strict=True)]
-    kinds = {"before": before, "after": found.residuals} | ({"held out": found.held_out} if found.held_out else {})
-    units = [joint_unit(robot, c) for c in range(robot.dof)]
-    rows = list(zip(robot.joint_names, *map(_rms, kinds.values()), units, strict=True))
-    return Table("\nrms of the residuals", ("joint", *kinds, "unit"), rows)
-
-
-def _rms(residuals: Sequence[Floats]) -> list[str]:
-    """That of each joint where there are samples; a motion that failed has none."""
-    if any(np.isnan(each).all() for each in residuals):
-        return ["no motion"] * residuals[0].shape[1]
-    return [f"{rms:.3g}" for rms in np.sqrt(np.nanmean(np.square(np.concatenate(residuals)), axis=0))]
-
-
-def _facts(found: Identification, written: Sequence[tuple[str, Path]]) -> Table:
-    spread = f" +- {1e3 * found.delay_deviation:.2g}" if found.delay_deviation else ", as given"
-    rows: list[tuple[str, object]] = [
-        ("status", found.status),
-        ("delay of the controls", f"{1e3 * found.delay:.4g}{spread} ms"),
-        *(("not told", sentence) for sentence in found.null_space),
-        *(("warning", finding) for finding in found.warnings),
-        *written,
-    ]
-    return Table("\nsearch", (), rows)

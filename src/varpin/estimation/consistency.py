@@ -10,25 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from varpin.arrays import Floats
+from varpin.model.inertia import of_pseudo_inertia, pseudo_inertia
 
 # Least eigenvalue of a body's pseudo-inertia that it begins with, as a share of the largest: links of URDFs are thin or
 # points, and a body without extent could never get any.
 _FLOOR = 1e-6
 _LOWER = np.tril_indices(4)
-
-
-def _pseudo_inertia(numbers: Floats) -> Floats:
-    """The matrix [[S, h], [h', m]] (4, 4) of m, h = m c, and moments, S = tr(I) / 2 - I."""
-    m, h, (xx, xy, yy, xz, yz, zz) = numbers[0], numbers[1:4], numbers[4:]
-    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return np.block([[0.5 * np.trace(inertia) * np.eye(3) - inertia, h[:, None]], [h[None], m]])
-
-
-def _numbers(P: Floats) -> Floats:
-    """The inverse of :func:`_pseudo_inertia`, for matrices (..., 4, 4)."""
-    moments = np.trace(P[..., :3, :3], axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - P[..., :3, :3]
-    rows, columns = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])
-    return np.concatenate([P[..., 3, 3, None], P[..., :3, 3], moments[..., rows, columns]], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +31,7 @@ class Body:
     @classmethod
     def around(cls, numbers: Floats) -> Body:
         """That of a body's numbers (10,), made definite where they are not."""
-        sizes, axes = np.linalg.eigh(_pseudo_inertia(numbers))
+        sizes, axes = np.linalg.eigh(pseudo_inertia(numbers))
         least = _FLOOR * max(float(sizes[-1]), _FLOOR)
         return cls(np.linalg.cholesky((axes * np.maximum(sizes, least)) @ axes.T))
 
@@ -56,4 +43,5 @@ class Body:
         slopes[np.arange(10), _LOWER[0], _LOWER[1]] = np.where(diagonal, np.exp(y), 1.0)
         root = self.root @ E
         change = self.root @ slopes @ root.T
-        return _numbers(root @ root.T), _numbers(change + np.swapaxes(change, 1, 2)).T
+        found, *columns = map(of_pseudo_inertia, (root @ root.T, *(change + np.swapaxes(change, 1, 2))))
+        return found, np.stack(columns, axis=1)

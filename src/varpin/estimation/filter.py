@@ -28,6 +28,7 @@ from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
 from varpin.simulation.choice import given_integrator, usual_integrator
 from varpin.support.checks import JointValues, finite_array, joint_array, positive
 from varpin.support.frozen import Frozen
+from varpin.support.markup import warning_count
 from varpin.trajectory import Trajectory
 
 # Standard deviations of a start that is not given, in units of those of the first two samples: it then counts for 1e-4
@@ -79,7 +80,10 @@ class Estimate(Frozen):
 
     def __repr__(self) -> str:
         what, n = "smoothed" if self.smoothed else "filtered", self.q.shape[1]
-        return f"Estimate({len(self.t)} samples, {n} joints, {what} by {self.integrator})"
+        return f"Estimate({len(self.t)} samples, {n} joints, {what} by {self.integrator}{warning_count(self.warnings)})"
+
+    def __str__(self) -> str:
+        return "\n".join([repr(self), *(f"warning: {warning}" for warning in self.warnings)])
 
     @property
     def innovations(self) -> Floats:
@@ -224,13 +228,8 @@ def filtered(
             "noise=varpin.AdditiveNoise(intensity)) says how strong the forces are that it does not know"
         )
     log, joints, n = grid.log, scene.robot.joint_names, scene.robot.dof
-    measured, variance = log.q, variances("q_noise", q_noise, joints)
-    q, first, rate, P = _first_samples(log, variance)
-    if v_noise is not None:
-        if log.v is None:
-            raise InputError("v_noise is given, and the log has no velocities v")
-        measured = np.concatenate([log.q, log.v], axis=1)
-        variance = np.concatenate([variance, variances("v_noise", v_noise, joints)])
+    measured, variance = measurements(log, joints, q_noise, v_noise)
+    q, first, rate, P = _first_samples(log, variance[:n])
     q0, v0, covariance = start
     first = first if q0 is None else joint_array("q0", q0, joints)
     rate = rate if v0 is None else joint_array("v0", v0, joints)
@@ -263,6 +262,18 @@ def smooth(scene: Scene, log: Log | Trajectory, *, q_noise: JointValues, **optio
     found = kalman_filter(scene, log, q_noise=q_noise, **options)
     states = _in_velocities(scene, *_backward(found.forward), variational=found.variational)
     return found.changed(**states, smoothed=True)
+
+
+def measurements(
+    log: Log, joints: tuple[str, ...], q_noise: JointValues, v_noise: JointValues | None
+) -> tuple[Floats, Floats]:
+    """Measured positions, with ``v_noise`` velocities beside them (K, z), and the variances of their errors (z,)."""
+    variance = variances("q_noise", q_noise, joints)
+    if v_noise is None:
+        return log.q, variance
+    if log.v is None:
+        raise InputError("v_noise is given, and a log has no velocities v")
+    return np.concatenate([log.q, log.v], axis=1), np.concatenate([variance, variances("v_noise", v_noise, joints)])
 
 
 def variances(name: str, value: JointValues, joints: tuple[str, ...]) -> Floats:

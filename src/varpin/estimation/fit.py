@@ -17,7 +17,7 @@ from scipy.optimize import lsq_linear
 from varpin.arrays import Floats
 from varpin.errors import InputError, LinearizationError, RobotError, SingularMassMatrix
 from varpin.estimation.consistency import Body
-from varpin.estimation.filter import Estimate, filtered, variances
+from varpin.estimation.filter import Estimate, filtered, measurements
 from varpin.estimation.grid import Grid
 from varpin.estimation.log import GAP, Log
 from varpin.estimation.parameters import INERTIAL, Parameters
@@ -73,34 +73,20 @@ class Fit:
     def __post_init__(self) -> None:
         if not self.horizon > 0.0:
             raise InputError(f"horizon must be positive [s], or np.inf for whole logs, got {self.horizon:g}")
-        of, joints = self.of, self.of.scene.robot.joint_names
-        self.deviation = np.sqrt(variances("q_noise", self.q_noise, joints))
-        self.v_deviation = None if self.v_noise is None else np.sqrt(variances("v_noise", self.v_noise, joints))
+        of, P, late = self.of, len(self.of.names), np.ones(int(self.delay is None))
+        self.noise = of.scene.robot.joint_names, self.q_noise, self.v_noise
         self.bodies = _bodies(of)
         self.prior = [c for columns, _ in self.bodies for c in columns]
-        self.size = len(of.names) + (self.delay is None)
+        self.size = P + late.size
+        # The scene's own values and no delay; and the least and the greatest y, which bodies do not have.
+        self.begin = np.concatenate([of.values, 0.0 * late])
+        self.bounds = np.concatenate([of.least, -LATEST * late]), np.concatenate([np.full(P, np.inf), LATEST * late])
+        self.begin[self.prior], self.bounds[0][self.prior] = 0.0, -np.inf
         # L and F are linear in all parameters together, but for gains of servos and for springs with their rests.
         self.varied = of.varied()
         self.linear = not any(name.startswith(("servo", "rest", "stiffness")) for name in of.names)
         self.best, self.least, self.done = self.begin, np.inf, 0
         self.rest, self.jacobian = np.zeros(1), np.zeros((1, self.size))
-
-    @cached_property
-    def begin(self) -> Floats:
-        """The coordinates of the scene's own values and of no delay (size,)."""
-        y = np.zeros(self.size)
-        y[: len(self.of.names)] = self.of.values
-        y[self.prior] = 0.0
-        return y
-
-    @cached_property
-    def bounds(self) -> tuple[Floats, Floats]:
-        """The least and the greatest y (size,); coordinates of bodies and most greatest values have none."""
-        free = self.size - (self.delay is None)
-        lower, upper = np.full(self.size, -LATEST), np.full(self.size, LATEST)
-        lower[:free], upper[:free] = self.of.least, np.inf
-        lower[self.prior] = -np.inf
-        return lower, upper
 
     def with_prior(self, r: Floats, J: Floats, y: Floats) -> tuple[Floats, Floats]:
         """Residuals and their derivatives in y, with those of the prior of bodies."""
@@ -113,9 +99,8 @@ class Fit:
         return float(r @ r)
 
     def values(self, y: Floats) -> tuple[Floats, Floats]:
-        """The parameters' values (P,) and their derivatives in y (P, size)."""
-        P = len(self.of.names)
-        values, slopes = y[:P].copy(), np.eye(P, self.size)
+        """The parameters' values (P,), and the derivatives of them, and of the delay if unknown, in y (size, size)."""
+        values, slopes = y[: len(self.of.names)].copy(), np.eye(self.size)
         for columns, body in self.bodies:
             values[columns], slopes[np.ix_(columns, columns)] = body.numbers(y[columns])
         return values, slopes
@@ -198,6 +183,8 @@ class Run:
     def __post_init__(self) -> None:
         self.grid = Grid.even(self.log, self.fit.dt)
         self.duration = float(self.log.t[-1] - self.log.t[0])
+        self.measured, variance = measurements(self.log, *self.fit.noise)
+        self.deviation = np.sqrt(variance)
 
     def settled(self, scene: Scene, late: float) -> list[Stretch]:
         """The stretches after a search for their starts, by shorter ones as :func:`identify` where none is known."""
@@ -259,16 +246,8 @@ class Stretch:
     @cached_property
     def measured(self) -> Floats:
         """The samples that are there (r,), in units of their deviations."""
-        log = self.run.log
-        return self._rows(log.q[self.samples], log.q[self.samples] if log.v is None else log.v[self.samples])
-
-    def _rows(self, q: Floats, v: Floats) -> Floats:
-        """Rows (r, ...) of those at the samples (k, n, ...) that are there, in units of the samples' deviations."""
-        fit, log, shape = self.run.fit, self.run.log, (1, -1, *[1] * (q.ndim - 2))
-        rows = [(q / fit.deviation.reshape(shape))[np.isfinite(log.q[self.samples])]]
-        if fit.v_deviation is not None and log.v is not None:
-            rows.append((v / fit.v_deviation.reshape(shape))[np.isfinite(log.v[self.samples])])
-        return np.concatenate(rows)
+        samples = (self.run.measured / self.run.deviation)[self.samples]
+        return samples[np.isfinite(samples)]
 
     @np.errstate(over="ignore", invalid="ignore")
     def residuals(
@@ -292,7 +271,9 @@ class Stretch:
         if not np.isfinite(x).all():
             return None
         state = np.concatenate([motion.q, motion.v], axis=1)[:, :, None]
-        rows = self._rows(*self.at_samples(*np.split(np.concatenate([state, x], axis=2), 2, axis=1)))
+        both = np.concatenate(self.at_samples(*np.split(np.concatenate([state, x], axis=2), 2, axis=1)), axis=1)
+        there = np.isfinite(self.run.measured[self.samples])
+        rows = (both[:, : there.shape[1]] / self.run.deviation[:, None])[there]
         r, J = rows[:, 0] - self.measured, rows[:, 1:]
         return (r, J[:, :m], J[:, m:]) if np.isfinite(np.vdot(J, J) + r @ r) else None
 
@@ -351,21 +332,16 @@ def _evaluated(fit: Fit, y: Floats, parts: Sequence[_Part]) -> tuple[Floats, Flo
     scene = fit.of.scene_with(values)
     varied, late = fit.changed(scene, values), fit.late(y)
     r, J = (np.concatenate(each) for each in zip(*(part(scene, varied, late) for part in parts), strict=True))
-    found: Floats = J[:, :-1] @ slopes
-    if fit.delay is None:
-        found[:, -1] = J[:, -1]
-    return r, found
+    return r, J[:, : fit.size] @ slopes
 
 
 def _innovations(fit: Fit, grid: Grid, scene: Scene, varied: Sequence[Varied], late: float) -> tuple[Floats, Floats]:
     """As :func:`predictions` for one log, in values and delay, by a filter with a row for each step."""
     u, by_delay = grid.controls(late)
     try:
-        seen = filtered(scene, grid.at_nodes(u), fit.q_noise, fit.v_noise, method=fit.integrator)
+        seen = filtered(scene, grid.at_nodes(u), *fit.noise[1:], method=fit.integrator)
     except LinearizationError:
-        known = np.isfinite(grid.log.q).sum()
-        if fit.v_noise is not None and grid.log.v is not None:
-            known += np.isfinite(grid.log.v).sum()
+        known = int(np.isfinite(measurements(grid.log, *fit.noise)[0]).sum())
         return np.full(known, LOST), np.zeros((known, len(varied) + 1))
     h, n = seen.given.h, scene.robot.dof
     alike = np.rint(np.log(h / h.min()) / _ALIKE)

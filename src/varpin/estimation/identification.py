@@ -12,14 +12,13 @@ from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.linalg import qr
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
-from varpin.estimation.filter import misfit
+from varpin.estimation.filter import measurements, misfit
 from varpin.estimation.fit import LATEST, LOST, Fit, Run, Stretch, predictions, simulations
 from varpin.estimation.grid import Grid
 from varpin.estimation.log import Log, as_log
@@ -27,10 +26,13 @@ from varpin.estimation.parameters import parameters_of
 from varpin.finding import Finding, announce
 from varpin.integrators import Gauss, Integrator
 from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
+from varpin.model import joint_unit
 from varpin.model.urdf_output import save_urdf
 from varpin.simulation.choice import given_integrator
-from varpin.support.checks import JointValues, count, finite, positive, real
+from varpin.support.checks import JointValues, count, finite, positive, real, tuple_of
 from varpin.support.frozen import Frozen
+from varpin.support.markup import warning_count
+from varpin.support.tables import Table
 from varpin.trajectory import Trajectory
 
 # Length [s] of the stretches that are simulated, each from a start of its own, unless it is given. Open-loop motions of
@@ -45,7 +47,7 @@ _SURE, _MISFIT = 4.0, 2.0
 # Deviations by which the logs ask for less than a least value that are told: zeros with noise are nearly always nearer.
 _PULLED = 3.0
 # Doubts about a log from which no value could be right.
-_NEVER = ("dead encoder", "clock of the log")
+_NEVER = ("dead encoder", "clock of the log", "log in degrees")
 
 logger = logging.getLogger(__name__)
 
@@ -93,11 +95,38 @@ class Identification(Frozen):
     warnings: tuple[Finding, ...] = ()
 
     def __repr__(self) -> str:
-        return f"Identification({len(self.names)} parameters of {len(self.logs)} logs, {self.status})"
+        payloads = "".join(f", {name}" for name in self.names if name.startswith("payload"))
+        warned = warning_count(self.warnings)
+        return f"Identification({len(self.names)} parameters{payloads}, {len(self.logs)} logs, {self.status}{warned})"
 
     def __str__(self) -> str:
-        rows = zip(self.names, self.start, self.values, self.deviations, self.units, strict=True)
-        return "\n".join(f"{name}: {old:.4g} -> {new:.5g} +- {sd:.2g} {unit}" for name, old, new, sd, unit in rows)
+        told = [f"warning: {warning}" for warning in self.warnings]
+        return "\n".join([repr(self), *(f"\n{part}" for part in self.tables), *told])
+
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """Tables of the values, of the residuals of each joint, and of the search."""
+        numbers = zip(self.names, self.start, self.values, self.deviations, self.units, strict=True)
+        values = [
+            (name, f"{old:.5g}", f"{new:.5g}", f"{sd:.2g}" if np.isfinite(sd) else "not told", unit)
+            for name, old, new, sd, unit in numbers
+        ]
+        robot = self.scene.robot
+        before = [log.q - own for log, own in zip(self.logs, self.predicted_before, strict=True)]
+        kinds = {"before": before, "after": self.residuals} | ({"held out": self.held_out} if self.held_out else {})
+        units = [joint_unit(robot, c) for c in range(robot.dof)]
+        spread = f" +- {1e3 * self.delay_deviation:.2g}" if self.delay_deviation else ", as given"
+        search = [("status", self.status), ("delay of the controls", f"{1e3 * self.delay:.4g}{spread} ms")]
+        search += [("not told", sentence) for sentence in self.null_space]
+        return (
+            Table(robot.name, ("parameter", "before", "value", "+-", "unit"), values),
+            Table(
+                "rms of the residuals",
+                ("joint", *kinds, "unit"),
+                list(zip(robot.joint_names, *map(_rms, kinds.values()), units, strict=True)),
+            ),
+            Table("search", (), search),
+        )
 
     @cached_property
     def deviations(self) -> Floats:
@@ -176,20 +205,17 @@ def identify(
     """
     refuse_constraints(require_scene(scene), "identify")
     of = parameters_of(scene, parameters)
-    given, others = _several("logs", logs), _several("held_out", held_out)
-    if not given:
+    given = (tuple_of("logs", logs, Log | Trajectory), tuple_of("held_out", held_out, Log | Trajectory))
+    matched, apart = ([as_log(each).matched(scene) for each in some] for some in given)
+    if not matched:
         raise InputError("logs is empty: give one varpin.Log at least")
-    chosen = given_integrator(integrator) or Gauss(2)
-    matched, apart = (tuple(as_log(each).matched(scene) for each in some) for some in (given, others))
-    if v_noise is not None and any(log.v is None for log in (*matched, *apart)):
-        raise InputError("v_noise is given, and a log has no velocities v")
     for doubt in (doubt for log in (*matched, *apart) for doubt in log.warnings if doubt.kind in _NEVER):
         raise InputError(f"{doubt}; values from this log would be wrong")
     step = min(float(np.median(np.diff(log.t))) for log in matched) if dt is None else positive("dt", dt, "s")
     length = _HORIZON if horizon is None else real("horizon", horizon)
     late = None if delay is None else finite("delay", delay)
-    fit = Fit(of, chosen, step, length, q_noise, v_noise, late, callback)
-    runs = [Run(fit, log) for log in matched]
+    fit = Fit(of, given_integrator(integrator) or Gauss(2), step, length, q_noise, v_noise, late, callback)
+    runs, others = ([Run(fit, log) for log in some] for some in (matched, apart))
     y, status, evaluation = fit.begin, "converged", count("evaluations", evaluations)
     try:
         if scene.processes:
@@ -201,16 +227,14 @@ def identify(
                 y, status = fit.search(partial(simulations, fit, stretches), y, evaluation, last=not finer)
     except KeyboardInterrupt:
         y, status = fit.best, "interrupted"
-    return _made(fit, y, runs, [Run(fit, log) for log in apart], status)
+    return _made(fit, y, runs, others, status)
 
 
-def _several(name: str, logs: Any) -> tuple[Any, ...]:
-    """One log or several as several."""
-    if isinstance(logs, Log | Trajectory):
-        return (logs,)
-    if not isinstance(logs, Sequence):
-        raise InputError(f"{name} must be a varpin.Log or several, got {type(logs).__name__}")
-    return tuple(logs)
+def _rms(residuals: Sequence[Floats]) -> list[str]:
+    """That of each joint where there are samples; a motion that failed has none."""
+    if any(np.isnan(each).all() for each in residuals):
+        return ["no motion"] * residuals[0].shape[1]
+    return [f"{rms:.3g}" for rms in np.sqrt(np.nanmean(np.square(np.concatenate(residuals)), axis=0))]
 
 
 def _made(fit: Fit, y: Floats, runs: Sequence[Run], apart: Sequence[Run], status: str) -> Identification:
@@ -220,7 +244,7 @@ def _made(fit: Fit, y: Floats, runs: Sequence[Run], apart: Sequence[Run], status
     # Where the residuals are larger than the encoders' noise, the values are less certain by as much.
     covariance = covariance * max(1.0, fit.cost / len(fit.jacobian))
     # Ctrl-C leaves out the motions and the check of the step that are not done, and keeps the values.
-    every = [*runs, *apart]
+    every, known, of = [*runs, *apart], len(runs), fit.of
     predicted, before = ([np.full(run.log.q.shape, np.nan) for run in every] for _ in range(2))
     changes = np.zeros(P)
     try:
@@ -233,7 +257,6 @@ def _made(fit: Fit, y: Floats, runs: Sequence[Run], apart: Sequence[Run], status
     except KeyboardInterrupt:
         status = "interrupted"
     residuals = [run.log.q - own for run, own in zip(every, predicted, strict=True)]
-    known, of = len(runs), fit.of
     made = Identification(
         names=of.names,
         values=values,
@@ -273,18 +296,18 @@ def _covariance(fit: Fit, slopes: Floats) -> tuple[Floats, tuple[str, ...]]:
     J = np.pad(fit.jacobian, ((0, max(0, fit.size - len(fit.jacobian))), (0, 0)))
     sizes = np.linalg.norm(J, axis=0)
     scale = np.where(sizes > _NOTHING * sizes.max(initial=1.0), sizes, 1.0)
-    _, spread, rows = np.linalg.svd(J / scale, full_matrices=False)
-    known = spread > _NOTHING * max(spread[0], 1.0)
     names = [*fit.of.names, *(["delay"] if fit.delay is None else [])]
-    # Of bodies the null space is that of their numbers.
-    to = slopes.copy() if fit.delay is not None else np.vstack([slopes, np.eye(1, fit.size, fit.size - 1)])
-    null = (rows[~known] / scale) @ to.T
-    joined = fit.with_prior(np.zeros(len(J)), J, fit.best)[1] / scale
-    _, spread, rows = np.linalg.svd(joined, full_matrices=False)
-    known = spread > _NOTHING * max(spread[0], 1.0)
-    root = (rows[known] / spread[known, None]) / scale
-    covariance = to @ (root.T @ root) @ to.T
-    lost = np.abs((rows[~known] / scale) @ to.T).max(axis=0, initial=0.0) > _NAMED / scale.max()
+
+    def split(J: Floats) -> tuple[Floats, Floats]:
+        """A root of the inverse of J' J where J tells of y, and what it does not tell, in parameters."""
+        _, spread, rows = np.linalg.svd(J / scale, full_matrices=False)
+        known = spread > _NOTHING * max(spread[0], 1.0)
+        return rows[known] / spread[known, None] / scale, (rows[~known] / scale) @ slopes.T
+
+    _, null = split(J)
+    root, left = split(fit.with_prior(np.zeros(len(J)), J, fit.best)[1])
+    covariance = slopes @ (root.T @ root) @ slopes.T
+    lost = np.abs(left).max(axis=0, initial=0.0) > _NAMED / scale.max()
     covariance[lost, :] = covariance[:, lost] = 0.0
     covariance[lost, lost] = np.inf
     return covariance, tuple(_sentences(null, names) if fit.done else ())
@@ -320,7 +343,7 @@ def _step_error(fit: Fit, runs: Sequence[Run], y: Floats) -> Floats:
         both, slopes = fit.with_prior(r, J, y)
         steps.append(np.linalg.lstsq(slopes, both, rcond=_NOTHING)[0])
     change: Floats = fit.values(y)[1] @ (steps[0] - steps[1])
-    return change
+    return change[: len(fit.of.names)]
 
 
 def _doubts(fit: Fit, made: Identification, changes: Floats) -> Iterator[Finding]:
@@ -360,7 +383,9 @@ def _misfit(fit: Fit, made: Identification) -> Iterator[Finding]:
     if fit.of.scene.processes:
         yield from misfit(fit.cost, len(fit.jacobian))
         return
-    squares = np.square(np.concatenate(made.residuals) / fit.deviation)
+    squares = (
+        np.square(np.concatenate(made.residuals)) / measurements(made.logs[0], *fit.noise)[1][: made.scene.robot.dof]
+    )
     there = np.isfinite(squares)
     by_joint = np.sqrt(np.where(there, squares, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1))
     worst = int(np.argmax(by_joint))

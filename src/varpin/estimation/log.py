@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from varpin.arrays import Floats
+from varpin.core import inverse_dynamics
 from varpin.errors import FileError, InputError, UnknownJoint
 from varpin.finding import Finding, announce
 from varpin.io.archive import atomic_file, read_npz, save_npz
@@ -30,6 +31,12 @@ GAP = 10.0
 _SLOW = 0.5
 # Distance beyond a joint's limits that is told [rad or m]: stops yield, and zeros of encoders are off, by less.
 _BEYOND = 0.1
+# Length [s] of the parabolas that tell the forces of a log, and the fewest samples of one, and parabolas, that do. The
+# noise of encoders spoils shorter ones, and what arms do within longer ones is lost.
+_PARABOLA, _FEW = 0.2, 4
+# Share of the squared forces that a scene lacks with the controls of a log, below which those that it lacks with the
+# opposite ones tell that these are right: drives that give a third to three times the torque they tell, the other way.
+_OPPOSITE = 0.25
 # Fewest samples of a joint: fewer tell no velocity.
 _LEAST = 2
 # The arrays of a log in files, of which the first three must be there.
@@ -211,6 +218,10 @@ def _doubts(scene: Scene, t: Floats, q: Floats, u: Floats) -> Iterator[Finding]:
         unit = joint_unit(scene.robot, far)
         text = f"q of {names[far]!r} is {beyond[far]:.3g} {unit} beyond its limits: columns may be in another order"
         yield Finding("log beyond limits", text, names[far], value=float(beyond[far]), unit=unit)
+    if turned := _opposite(scene, t, q, u):
+        of = ", ".join(map(repr, turned))
+        text = f"u of {of} fits the motion far better with the opposite sign: turn it, or that of q where it is wrong"
+        yield Finding("sign of the controls", text)
     still, driven = most == least, (scene.actuation != 0.0) @ (np.ptp(u, axis=0) > 0.0)
     # An encoder that reads one number to the last bit while a control that changes acts on its joint.
     for joint in np.flatnonzero(still & driven & (not still.all())):
@@ -219,6 +230,23 @@ def _doubts(scene: Scene, t: Floats, q: Floats, u: Floats) -> Iterator[Finding]:
     if steps[at] > GAP * usual:
         text = f"the log has no samples for {steps[at]:.4g} s after t = {t[at]:.6g} s, its usual step is {usual:.3g} s"
         yield Finding("gap in the log", text, time=float(t[at]), value=float(steps[at]), unit="s")
+
+
+def _opposite(scene: Scene, t: Floats, q: Floats, u: Floats) -> list[str]:
+    """The joints that move as if their controls had the opposite sign, by inverse dynamics of parabolas."""
+    rows, k = np.flatnonzero(np.isfinite(q).all(axis=1)), round(_PARABOLA / float(np.median(np.diff(t))))
+    if k < _FEW or len(rows) < _FEW * k:
+        return []
+    at = rows[: len(rows) // k * k].reshape(-1, k)
+    s = t[at] - t[at].mean(axis=1, keepdims=True)
+    parabolas = np.linalg.pinv(np.stack([np.ones_like(s), s, 0.5 * s**2], axis=2)) @ q[at]
+    place, v, a = (np.ascontiguousarray(parabolas[:, j]) for j in range(3))
+    needed, force = inverse_dynamics(scene.core, place, v, a), u[at].mean(axis=1) @ scene.actuation.T
+    # Friction and dampers that the scene does not have, of any size, tell nothing.
+    passive = np.linalg.qr(np.array([np.sign(v), v]).T)[0]
+    off = np.array([needed - own - scene.core.forces(place, v, own)[0] for own in (force, -force)]).T
+    told, turned = np.square(off - passive @ (passive.swapaxes(1, 2) @ off)).sum(axis=1).T
+    return [name for name, wrong in zip(scene.robot.joint_names, turned < _OPPOSITE * told, strict=True) if wrong]
 
 
 def _from_csv(source: Path) -> dict[str, Any]:

@@ -64,7 +64,7 @@ class Sensitivities:
     @property
     def start(self) -> Floats:
         """Derivatives of (q, v) at the nodes in (q0, v0) (N + 1, 2n, 2n)."""
-        return self._map.forward(np.eye(2 * self.q.shape[1]), None)
+        return self._map.forward(np.eye(2 * self.q.shape[1]), np.zeros((len(self.q), 1, 1)))
 
     def gradient(
         self, loss_q: ArrayLike | None = None, *, loss_v: ArrayLike | None = None, loss_p: ArrayLike | None = None
@@ -97,12 +97,12 @@ class MotionMap:
     to_p: Floats  # (N + 1, n, 2n) of p in (q, v)
     pull: Floats  # (N + 1, n, P) of p at fixed (q, v)
 
-    def forward(self, x: Floats, D: Floats | None) -> Floats:
-        """States (N + 1, 2n, k) from the first (2n, k)."""
+    def forward(self, x: Floats, D: Floats) -> Floats:
+        """States (N + 1, 2n, k) from the first (2n, k), where each step adds D (N, 2n, k)."""
         states = np.empty((len(self.A) + 1, *x.shape))
         states[0] = x
         for j, A in enumerate(self.A):
-            states[j + 1] = A @ states[j] if D is None else A @ states[j] + D[j]
+            states[j + 1] = A @ states[j] + D[j]
         return states
 
     def backward(self, in_q: Floats, in_v: Floats, in_p: Floats) -> Gradient:

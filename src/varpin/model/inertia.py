@@ -98,6 +98,16 @@ def inertial_numbers(robot: Robot, link: str) -> tuple[int, Floats]:
     return joint, np.array(robot.model.inertias[joint].toDynamicParameters())
 
 
+def pseudo_inertia(numbers: Floats) -> Floats:
+    """The matrix [[S, h], [h', m]] (4, 4) of m, h = m c, and moments I (10,), S = tr(I) / 2 - I."""
+    return np.asarray(pin.PseudoInertia.FromDynamicParameters(numbers).toMatrix())
+
+
+def of_pseudo_inertia(matrix: Floats) -> Floats:
+    """The numbers (10,) of :func:`pseudo_inertia`, in which they are linear."""
+    return np.asarray(pin.PseudoInertia.FromMatrix(matrix).toDynamicParameters())
+
+
 def point_mass(robot: Robot, frame: str) -> tuple[int, Floats]:
     """The joint that moves a frame, and the numbers (10,) of :func:`inertial_numbers` of 1 kg at its origin."""
     joint, _ = inertial_numbers(robot, frame)

@@ -175,8 +175,9 @@ def _with_rotors(robot: Robot, armature: JointValues) -> Robot:
         given = {name: value for name, value in armature.items() if name not in robot.locked}
         armature = dict(zip(names, values[indices].tolist(), strict=True)) | given
     values[indices] = joint_array("armature", armature, names, uniform=True)
-    if (values < 0.0).any():
-        raise InputError(f"armature must be >= 0 [kg m^2 or kg], got {values[indices]}")
+    least, joint = min(zip(values[indices], names, strict=True))
+    if least < 0.0:
+        raise InputError(f"armature of joint {joint!r} must be >= 0 [kg m^2 or kg], got {least:g}")
     model.armature = values
     return robot.changed(model=model)
 

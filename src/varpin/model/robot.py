@@ -22,7 +22,7 @@ from varpin.model.meshes import Reader, read_mesh, with_own_meshes
 from varpin.model.mimic import Tie, rebuild
 from varpin.model.mjcf import mjcf_shapes
 from varpin.model.srdf import Posture
-from varpin.model.tree import flatten, place_of_frame
+from varpin.model.tree import flatten, joint_axis, place_of_frame
 from varpin.model.units import NO_LIMIT
 from varpin.model.urdf import Inertial, build_shapes, listed, read_urdf
 from varpin.support import markup
@@ -31,6 +31,9 @@ from varpin.support.frozen import Frozen
 
 # A velocity or an effort beyond this is none: files of other programs have the largest double.
 _HUGE = 1e300
+# Distance [m] of a frame from a joint's axis that is none: more than what rounded angles of a file make, and less than
+# cameras and fingers are aside.
+_ASIDE = 1e-3
 
 
 class Part(NamedTuple):
@@ -213,12 +216,19 @@ class Robot(Frozen):
             raise InputError(f"{name} must have shape (..., {self.dof}), got {given.shape}")
         return given
 
-    @property
+    @cached_property
     def end_effector(self) -> str:
-        """Name of the last frame on the joint with the most ancestors, or on the last of several such joints."""
+        """Name of the frame that is farthest out on the axis of the joint with the most ancestors, as flanges are.
+
+        It is the last one of several there, or of all frames that the joint moves if none is on its axis.
+        """
         depths = [len(path) for path in self.model.supports]
         last = max(range(self.model.njoints), key=lambda j: (depths[j], j))
-        return str([frame.name for frame in self.model.frames if frame.parentJoint == last][-1])
+        frames = [frame for frame in self.model.frames if frame.parentJoint == last]
+        places, axis = np.array([frame.placement.translation for frame in frames]), joint_axis(self.model, last)[1]
+        out = np.abs(places @ axis)
+        out[np.linalg.norm(np.cross(places, axis), axis=1) > _ASIDE] = 0.0
+        return str(frames[np.flatnonzero(out > out.max() - _ASIDE)[-1]].name)
 
     def frame_positions(self, q: ArrayLike, frame: str | None = None) -> Floats:
         """World positions (..., 3) [m] of a frame, or of :attr:`end_effector`, at ``q`` (..., n).

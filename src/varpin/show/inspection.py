@@ -177,6 +177,7 @@ class RobotReport(Frozen):
         frames = [(x.name, x.kind, x.parent or "the world", x.joint or "the base") for x in self.frames]
         whole = [
             ("degrees of freedom", self.robot.dof),
+            ("end effector", self.robot.end_effector),
             ("mass that moves [kg]", f"{self.total_mass:.5g}"),
             ("at q [rad or m]", "  ".join(f"{x:g}" for x in self.q)),
         ]

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from numbers import Real
 from pathlib import Path
+from types import UnionType
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -47,7 +48,7 @@ def rotation_matrix(name: str, value: ArrayLike) -> Floats:
     return R
 
 
-def tuple_of(name: str, given: Any, kind: type, note: str = "") -> tuple[Any, ...]:
+def tuple_of(name: str, given: Any, kind: type | UnionType, note: str = "") -> tuple[Any, ...]:
     """``given``, an object of type ``kind`` or a sequence of them, as a tuple.
 
     The ``name`` is the plural of the type; a ``note`` ends messages, where other objects have the same name.
