@@ -1,53 +1,23 @@
 """Logs as they come from arms, with what is wrong with them: one clear error, a warning that fits, or right values."""
 
-import functools
-
 import numpy as np
 import pytest
+from logged import NAMES, NOISE, TRUTH, motion, start
 from refusals import naming, refused
 
 import varpin as vp
 
-NOISE = 2e-4
-TRUTH = np.array([2.0, 1.5, 1.0, 0.3, 0.2, 0.1, 2.0])
-NAMES = ["damping", "payload"]
-MIDDLE = np.array([0.0, -1.2, 1.2, -0.5, 0.5, 0.0])
 ORDER = [2, 1, 0, 3, 4, 5]  # as joint states come by name, the elbow first
 
 
-def start():
-    return vp.Scene(vp.load_robot("ur5"), damping=0.0)
-
-
-@functools.cache
 def measured(late=0):
-    """Times, positions with noise and torques of a UR5 whose torques act ``late`` ms later than they are told."""
-    scene = vp.Scene(vp.load_robot("ur5", payload=vp.Payload("tool0", 2.0)), damping=TRUTH[:6])
-    rng, N = np.random.default_rng(3), 150
-    phase, rate, size = rng.uniform(0, 6, (3, 6)), rng.uniform(0.3, 1.5, (3, 6)), rng.uniform(0.1, 0.2, (3, 6))
-
-    def law(t, q, v):
-        goal = MIDDLE + np.sum(size / rate * (np.sin(2.0 * np.pi * rate * t + phase) - np.sin(phase)), axis=0)
-        M = scene.core.jets(q[None], v[None])[0][0]
-        return scene.holding_torque(q) + M @ (200.0 * (goal - q) - 20.0 * v) + scene.damping * v
-
-    options = {"dt": 1e-3, "steps": 10 * N, "integrator": vp.Gauss(3), "check": False}
-    motion = vp.simulate(scene, MIDDLE, np.zeros(6), controls=law, period=10, **options)
-    told = motion.u
-    if late:
-        acting = np.concatenate([np.repeat(told[:1], late, axis=0), told])[: 10 * N]
-        motion = vp.simulate(scene, MIDDLE, np.zeros(6), controls=acting, **options)
-    q = motion.q[::10] + NOISE * np.random.default_rng(0).standard_normal((N + 1, 6))
-    return motion.t[::10], q, told[np.r_[0 : 10 * N : 10, -1]]
+    """Times, positions with noise and torques that act ``late`` ms later than they are told."""
+    q, u = motion(late, duration=1.5)
+    return 1e-2 * np.arange(len(q)), q + NOISE * np.random.default_rng(0).standard_normal(q.shape), u
 
 
 def found(t, q, u, joints=None, **options):
     return vp.identify(start(), vp.Log(t, q, u, joints=joints), NAMES, q_noise=NOISE, **options)
-
-
-def off(each):
-    """The farthest value in units of its deviation."""
-    return np.abs((each.values - TRUTH) / each.deviations).max()
 
 
 def spoiled(values, at, by):
@@ -78,8 +48,6 @@ WARNED = {
     "an encoder that dies": (lambda t, q, u: (t, spoiled(q, np.s_[70:, 3], q[70, 3]), u), ("q_noise",)),
     "an encoder with its sign turned": (lambda t, q, u: (t, q * [1, 1, -1, 1, 1, 1], u), ("column", "q_noise")),
 }
-
-
 SLOW = ("columns in another order",)
 
 
@@ -102,6 +70,6 @@ def test_values_are_right_all_the_same(what):
         "an epoch's clock": (t + 1.7e9, q, u),
     }
     each = found(*given.get(what, (t, q, u)))
-    assert off(each) < 5.0
+    assert (np.abs(each.values - TRUTH) < 5.0 * each.deviations).all()
     assert each.delay == pytest.approx(1e-3 * late, abs=1e-4)
     assert bool(naming(each.warnings, "controls", "later")) == bool(late)

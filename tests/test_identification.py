@@ -5,44 +5,13 @@ import logging
 
 import numpy as np
 import pytest
+from logged import DAMPING, MIDDLE, NAMES, NOISE, TRUTH, motion, start
 from refusals import naming, refused
 
 import varpin as vp
 from varpin.estimation.consistency import Body
 from varpin.estimation.fit import simulations
 from varpin.estimation.parameters import parameters_of
-
-DAMPING = np.array([2.0, 1.5, 1.0, 0.3, 0.2, 0.1])
-NOISE = 2e-4
-MIDDLE = np.array([0.0, -1.2, 1.2, -0.5, 0.5, 0.0])
-NAMES = ["damping", "payload"]
-
-
-def start(**options):
-    return vp.Scene(vp.load_robot("ur5"), damping=0.0, **options)
-
-
-@functools.cache
-def motion(late=0, damping=tuple(DAMPING), friction=0.0, duration=2.0):
-    """A UR5 with 2 kg under torques that are held for 10 ms, and act ``late`` ms later: by 1 ms steps of Gauss(3)."""
-    robot = vp.load_robot("ur5", payload=vp.Payload("tool0", 2.0))
-    scene = vp.Scene(robot, damping=damping, friction=friction)
-    rng, N = np.random.default_rng(4), round(duration / 1e-2)
-    phase, rate, size = rng.uniform(0, 6, (3, 6)), rng.uniform(0.3, 1.2, (3, 6)), rng.uniform(0.1, 0.4, (3, 6))
-
-    def law(t, q, v):
-        goal = MIDDLE + np.sum(size * np.sin(2.0 * np.pi * rate * t + phase), axis=0)
-        M = scene.core.jets(q[None], v[None])[0][0]
-        return scene.holding_torque(q) + M @ (100.0 * (goal - q) - 16.0 * v) + scene.damping * v
-
-    options = {"dt": 1e-3, "steps": 10 * N, "integrator": vp.Gauss(3), "check": False}
-    made = vp.simulate(scene, MIDDLE, np.zeros(6), controls=law, period=10, **options)
-    if late:
-        u = np.concatenate([np.repeat(made.u[:1], late, axis=0), made.u])[: 10 * N]
-        return vp.simulate(scene, MIDDLE, np.zeros(6), controls=u, **options).q[::10], made.u[
-            np.r_[0 : 10 * N : 10, -1]
-        ]
-    return made.q[::10], made.u[np.r_[0 : 10 * N : 10, -1]]
 
 
 def log(seed=0, noise=NOISE, **options):
@@ -53,9 +22,6 @@ def log(seed=0, noise=NOISE, **options):
 
 def within(found, truth, deviations=4.0):
     return (np.abs(found.values - truth) <= deviations * found.deviations).all()
-
-
-TRUTH = np.append(DAMPING, 2.0)
 
 
 def test_dampers_and_payload_with_their_deviations():
