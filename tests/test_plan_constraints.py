@@ -530,13 +530,8 @@ def least_distance(points, segment):
     """By least squares with non-negative shares that sum to 1 on each side."""
     heavy = 1e5
     ones, none = np.ones(len(points)), np.zeros(len(points))
-    rows = np.vstack(
-        [
-            np.hstack([points.T, -segment.T]),
-            heavy * np.r_[ones, 0.0, 0.0],
-            heavy * np.r_[none, 1.0, 1.0],
-        ]
-    )
+    sums = heavy * np.vstack([np.r_[ones, 0.0, 0.0], np.r_[none, 1.0, 1.0]])
+    rows = np.vstack([np.hstack([points.T, -segment.T]), sums])
     shares, _ = nnls(rows, np.r_[0.0, 0.0, 0.0, heavy, heavy])
     one, other = shares[: len(points)], shares[len(points) :]
     return np.linalg.norm(points.T @ one / one.sum() - segment.T @ other / other.sum())

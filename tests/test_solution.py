@@ -3,10 +3,9 @@
 import dataclasses
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from findings import about
-from oracles import exact, slope
+from oracles import Mechanism, exact, slope
 from plan_problems import SMALL, UR5, arm, linear, reach
 from refusals import naming, refused, unnamed
 
@@ -102,20 +101,14 @@ def test_motion_that_runs_away():
 
 def test_policy_on_velocities_and_back():
     plan = vp.solve(arm(*UR5, lambda *_: [], hold=5, integrator=vp.Midpoint()), check=False)
-    model, data, n = plan.problem.scene.robot.model, plan.problem.scene.robot.model.createData(), 6
-
-    def momentum(q, v):
-        M = pin.crba(model, data, q)
-        return (np.triu(M) + np.triu(M, 1).T) @ v
-
+    own, n = Mechanism(plan.problem.scene), 6
     policy = plan.policy_on("velocity")
     assert policy.hold_at(plan.problem.dt / 5) == 25
     for r in (0, 2, 5):
         q, v = plan.trajectory.q[5 * r], plan.trajectory.v[5 * r]
         np.testing.assert_array_equal(policy.reference[r], np.concatenate([q, v]))
-        columns = np.array([slope(lambda x, v=v: momentum(x, v), q, e, 0.02) for e in np.eye(n)])
-        M = np.array([momentum(q, e) for e in np.eye(n)]).T
-        turned = plan.gains[r] @ np.block([[np.eye(n), np.zeros((n, n))], [columns.T, M]])
+        columns = np.array([slope(lambda x, v=v: own.mass_matrix(x) @ v, q, e, 0.02) for e in np.eye(n)])
+        turned = plan.gains[r] @ np.block([[np.eye(n), np.zeros((n, n))], [columns.T, own.mass_matrix(q)]])
         np.testing.assert_allclose(policy.gains[r], turned, rtol=0, atol=1e-8 * np.abs(turned).max())
     other = plan.problem.at(integrator=vp.RungeKutta4())
     turned = dataclasses.replace(plan, problem=other, gains=plan.policy_on("velocity").gains.copy())
