@@ -365,9 +365,16 @@ def test_matrices_beyond_the_range_of_indices_are_refused_before_there_is_room_f
     own |= {"parent": np.arange(-1, n - 1), "coordinate": np.arange(n), "origin": np.repeat([1, 0], [1, n - 1])}
     own |= {"loads": np.zeros(0, dtype=np.int64), "carried": np.zeros((0, n), dtype=np.int64), "ends": np.array([n])}
     none = np.zeros((n, 0))
-    given = {"gravity": np.zeros(3), "forces": [], "couplings": [], "constraints": ConstraintRows(), "custom": None}
-    field = Diffusion(none, np.zeros((n, 0, 0)), none, none)
-    chain = core.Mechanism.make(Tree(**own, groups=1), actuation=none, diffusion=field, **given)
+    chain = core.Mechanism.make(
+        Tree(**own, groups=1),
+        gravity=np.zeros(3),
+        forces=[],
+        couplings=[],
+        constraints=ConstraintRows(),
+        custom=None,
+        actuation=none,
+        diffusion=Diffusion(none, np.zeros((n, 0, 0)), none, none),
+    )
     still = np.zeros((1, n))
     step = (vp.Midpoint().scheme.tableau, 0.5, vp.Midpoint()._guards(vp.Guard()))
     assert core.Rollout(chain, *step, 1.0, 1).begin(still, still)

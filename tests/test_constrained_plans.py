@@ -22,8 +22,14 @@ def rails():
         joint = model.addJoint(0, pin.JointModelPX(), place, f"slide{k}")
         model.appendBodyToJoint(joint, pin.Inertia.FromSphere(mass, 0.1), pin.SE3.Identity())
     tie = vp.CustomConstraint(1, lambda q: ROW @ q - 0.2, lambda _: ROW, lambda _q, _w: np.zeros((3, 3)))
-    given = {"stiffness": STIFFNESS, "damping": DAMPING, "actuation": ACTUATION, "constraints": tie}
-    return vp.Scene(vp.load_robot(model), gravity=False, **given)
+    return vp.Scene(
+        vp.load_robot(model),
+        gravity=False,
+        stiffness=STIFFNESS,
+        damping=DAMPING,
+        actuation=ACTUATION,
+        constraints=tie,
+    )
 
 
 def test_a_linear_quadratic_plan_is_optimal_and_so_is_its_feedback():

@@ -31,10 +31,19 @@ def true_motions(scene, size, *, steps=100, paths=1, fine=20, h=H, seed=0, more=
     n = scene.robot.dof
     u = waves(size, steps, n)
     q0 = np.linspace(0.3, -0.9, n)
-    given = {"dt": h / fine, "steps": steps * fine, "controls": np.repeat(u + more, fine, axis=0), "quantiles": []}
-    given |= {"paths": paths, "rng": seed, "integrator": vp.Midpoint(kick="held")}
-    made = vp.simulate_ensemble(scene, q0, np.zeros(n), **given)
-    return made.q[:, ::fine], made.v[:, ::fine], np.vstack([u, u[-1:]])
+    paths = vp.simulate_ensemble(
+        scene,
+        q0,
+        np.zeros(n),
+        dt=h / fine,
+        steps=steps * fine,
+        paths=paths,
+        rng=seed,
+        controls=np.repeat(u + more, fine, axis=0),
+        integrator=vp.Midpoint(kick="held"),
+        quantiles=[],
+    )
+    return paths.q[:, ::fine], paths.v[:, ::fine], np.vstack([u, u[-1:]])
 
 
 def log_of(q, u, *, h=H, seed=1, noise=ENCODER, **options):

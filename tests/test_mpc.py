@@ -317,8 +317,15 @@ def test_ticks_within_speeds_are_close_to_their_optimum():
     scene = vp.Scene(robot, damping=0.1)
     cost = vp.TrackingCost(lambda t: begin + 0.35 * np.sin(2.0 * t) * np.cos(np.arange(6)), 100.0)
     cost += vp.VelocityCost(0.05) + vp.ControlCost(1e-4, scene.holding_torque(begin))
-    given = {"dt": 0.02, "steps": 25, "constraints": [vp.WithinVelocityLimits(robot, (-0.3, 0.3))]}
-    problem = vp.OptimalControlProblem(scene, cost, begin, np.zeros(6), **given)
+    problem = vp.OptimalControlProblem(
+        scene,
+        cost,
+        begin,
+        np.zeros(6),
+        dt=0.02,
+        steps=25,
+        constraints=[vp.WithinVelocityLimits(robot, (-0.3, 0.3))],
+    )
     one, three = (vp.Mpc(problem, iterations=count).run(duration=0.6) for count in (1, 3))
     costs = [np.mean([plan.cost for plan in run.plans]) for run in (one, three)]
     assert costs[0] <= 1.05 * costs[1]
