@@ -3,8 +3,6 @@
 Chains of rods at every extreme, and those motions of them that make sense for any robot.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """What a warning or a reason is about: its kind, or words of it where it is plain text, quoted here alone."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 # Words of findings in logs, reports and files, by their kinds.

@@ -1,7 +1,5 @@
 """Robots made up for tests: random trees in Pinocchio, and URDF texts put together from links and joints."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -42,12 +40,18 @@ def arm(folder: Path, inertial: str = INERTIAL, **joint_arguments: str) -> Path:
     return write_urdf(folder, link("l1", inertial), joint("j1", "base", "l1", **joint_arguments))
 
 
+def built(*bodies: tuple[pin.JointModel, list[float], pin.Inertia | None]) -> vp.Robot:
+    """Joints in a row, joint0, joint1, ..., each with its place on the one before and the body that it moves."""
+    model, joint = pin.Model(), 0
+    for k, (kind, offset, inertia) in enumerate(bodies):
+        joint = model.addJoint(joint, kind, pin.SE3(np.eye(3), np.array(offset, dtype=float)), f"joint{k}")
+        model.appendBodyToJoint(joint, inertia or pin.Inertia.Zero(), pin.SE3.Identity())
+    return vp.load_robot(model)
+
+
 def slider(mass: float = 1.0) -> vp.Robot:
     """A mass on a rail along x, nothing else."""
-    model = pin.Model()
-    joint = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "slide")
-    model.appendBodyToJoint(joint, pin.Inertia.FromSphere(mass, 0.1), pin.SE3.Identity())
-    return vp.load_robot(model)
+    return built((pin.JointModelPX(), [0, 0, 0], pin.Inertia.FromSphere(mass, 0.1)))
 
 
 def crank_and_slider() -> vp.Robot:
@@ -115,11 +119,3 @@ def random_tree(
     if armature:
         model.armature = rng.uniform(0.0, 0.1, model.nv)
     return model
-
-
-def mass_matrix(robot: vp.Robot, q: np.ndarray, data: pin.Data) -> np.ndarray:
-    """M(q) (n, n) by Pinocchio's composite rigid body algorithm, armature included [kg m^2, kg m or kg]."""
-    full = pin.crba(robot.model, data, robot.configuration(q))
-    full = np.triu(full) + np.triu(full, 1).T
-    G = robot.velocity(np.eye(robot.dof)).T
-    return G.T @ full @ G

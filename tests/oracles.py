@@ -4,8 +4,7 @@ Everything is written on Pinocchio's own calls and SciPy, in the coordinates of 
 takes a step of the library.
 """
 
-from __future__ import annotations
-
+import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -274,6 +273,36 @@ def assert_jet(scene: vp.Scene, q: np.ndarray, v: np.ndarray, backend: str) -> N
     np.testing.assert_allclose(jet.Lqq @ dq, in_q, rtol=0, atol=1e-9 * size)
     in_q = slope(lambda x: own.mass_matrix(x) @ v, q, dq, 0.02)
     np.testing.assert_allclose(jet.Lvq @ dq, in_q, rtol=0, atol=1e-9 * size)
+
+
+def assert_same_jet(
+    one: vp.LagrangianJet, other: vp.LagrangianJet, keep: object = slice(None), rtol: float = 1e-12
+) -> None:
+    """Jet ``one`` is ``other`` on the coordinates ``keep`` of that, relative to its largest entries."""
+    for name in ("Lq", "Lv", "Lqq", "Lvq", "Lvv"):
+        whole = getattr(other, name)
+        part = whole[keep] if whole.ndim == 1 else whole[keep][:, keep]
+        np.testing.assert_allclose(getattr(one, name), part, rtol=0, atol=rtol * np.abs(whole).max(), err_msg=name)
+
+
+def off_constraints(scene: vp.Scene, motion: vp.Trajectory) -> tuple[float, float]:
+    """By how much a motion misses its constraints: the largest residual, and its largest rate."""
+    g, _, C = scene.core.constraints(motion.q)
+    return float(np.abs(g).max()), float(np.abs(np.einsum("kmn,kn->km", C, motion.v)).max())
+
+
+def same(one: object, other: object) -> bool:
+    """Whether two records are the same to the last bit."""
+    if dataclasses.is_dataclass(one):
+        names = [own.name for own in dataclasses.fields(one)]
+        return one is other or all(same(getattr(one, name), getattr(other, name)) for name in names)
+    if isinstance(one, np.ndarray):
+        return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
+    if hasattr(one, "keys"):
+        return list(one) == list(other) and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, tuple | list):
+        return len(one) == len(other) and all(map(same, one, other))
+    return one == other or repr(one) == repr(other)  # as NaN
 
 
 def normals(own: vp.Constraint) -> np.ndarray:

@@ -7,8 +7,6 @@
 and ``HARD`` leave hardly any room.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -204,6 +202,9 @@ SMALL = {
     "held over 3 steps": row(9.465277, speeds(2.2), hold=3, kkt=1e-4, scipy=True, **FINER, **LIMITS),
     "held over 2 steps, rates": row(2.1258071, vp.WithinControlRate(110.0), hold=2, **FINER),
     "held, between nodes": row(3.5974214, speeds(1.8), within=3.6e-4, **BETWEEN),
+    "held, speeds and a reference in rows": row(
+        3.7236627, speeds(1.8), more=vp.TrackingCost(LINE, 10.0), kkt=1e-4, scipy=True
+    ),
     "held over 2 steps, between nodes": row(3.6647232, speeds(1.8), between_nodes=True, hold=2, within=3.6e-4),
     "held, sphere between nodes": row(31.882135, SPHERE, within=1e-4, **BETWEEN),
     "held, clear of a ball between nodes": row(40.01867, CLEAR, within=1e-4, **BETWEEN),
@@ -235,6 +236,8 @@ SMALL = {
     ),
     "an input, linear": Case(lambda: hand("linear"), 0.11032363),
     "an input, cubic": Case(lambda: hand("cubic"), 0.084316886, SECOND),
+    "an input, held": Case(lambda: hand("linear", controls="held"), 0.031895044),
+    "an input, held, cubic": Case(lambda: hand("cubic", controls="held"), 0.027552717, kkt=1e-4),
     "an input, speeds between nodes": Case(
         lambda: hand("linear", constraints=[HAND_SPEEDS], between_nodes=True), 0.30936308, kkt=None, within=3.4e-3
     ),

@@ -1,7 +1,5 @@
 """What an error or a warning has to name: the facts, as whole words in any order, whatever the sentence around them."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Whatever is given as an argument: an error that names it, or a finite result; never the core beyond its arrays."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import math
@@ -225,11 +223,6 @@ def test_arguments_of_a_motion(name, value, facts):
         motion(**{name: value})
 
 
-def test_laws_of_an_ensemble_are_refused():
-    with refused(vp.InputError, "simulate"):
-        ensemble(controls=lambda t, q, v: [0.0, 0.0])
-
-
 @pytest.mark.parametrize("integrator", [None, vp.Midpoint(), vp.RungeKutta4()], ids=str)
 @pytest.mark.parametrize("kind", ["law", "open loop"])
 @pytest.mark.parametrize(
@@ -260,7 +253,9 @@ def test_control_functions(integrator, kind, value, facts):
     assert isinstance(error.__cause__, ZeroDivisionError) == ("ZeroDivisionError" in facts)
 
 
-def test_a_broken_open_loop_ends_an_ensemble():
+def test_a_law_is_refused_for_an_ensemble_and_a_broken_open_loop_ends_it():
+    with refused(vp.InputError, "simulate"):
+        ensemble(controls=lambda t, q, v: [0.0, 0.0])
     with refused(vp.ControlError, "step 1", "OpenLoop", "(2,)") as info:
         ensemble(controls=vp.OpenLoop(lambda t: [0.0, 0.0] if t < 1e-3 else [0.0]))
     assert info.value.trajectory is None

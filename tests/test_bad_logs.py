@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from logged import NAMES, NOISE, TRUTH, motion, start
 from refusals import naming, refused
 from ur5_logs import NAMES, NOISE, TRUTH, motion, start
 
@@ -19,11 +20,6 @@ def measured(late=0):
 def found(t, q, u, joints=None, **options):
     log = vp.Log(t, q, u, joints=joints, controls=start().robot.joint_names)
     return vp.identify(start(), log, NAMES, q_noise=NOISE, **options)
-
-
-def off(each):
-    """The farthest value in units of its deviation."""
-    return np.abs((each.values - TRUTH) / each.deviations).max()
 
 
 def spoiled(values, at, by):
@@ -55,8 +51,6 @@ WARNED = {
     "columns in another order": (lambda t, q, u: (t, q[:, ORDER], u[:, ORDER]), ("column", "q_noise")),
     "an encoder that dies": (lambda t, q, u: (t, spoiled(q, np.s_[70:, 3], q[70, 3]), u), ("q_noise",)),
 }
-
-
 SLOW = ("columns in another order",)
 
 
@@ -100,6 +94,6 @@ def test_values_are_right_all_the_same(what):
         "an epoch's clock": (t + 1.7e9, q, u),
     }
     each = found(*given.get(what, (t, q, u)))
-    assert off(each) < 5.0
+    assert (np.abs(each.values - TRUTH) < 5.0 * each.deviations).all()
     assert each.delay == pytest.approx(1e-3 * late, abs=1e-4)
     assert bool(naming(each.warnings, "controls", "later")) == bool(late)

@@ -1,7 +1,5 @@
 """What a motion tells about itself: its error against SciPy on Pinocchio's aba, its warnings, and the log."""
 
-from __future__ import annotations
-
 import logging
 import pickle
 import re

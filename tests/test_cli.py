@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from chromium import commands
 from findings import about
-from mechanisms import joint, write_urdf
+from mechanisms import joint, link, write_urdf
 from refusals import naming, unnamed
 from rich.console import Console
 
@@ -21,18 +21,11 @@ import varpin_command
 from varpin.cli import console, main
 from varpin.model import load_robot
 
-ROD = '<mass value="1"/><origin xyz="0.5 0 0"/><inertia ixx="0.001" ixy="0" ixz="0" iyy="0.083" iyz="0" izz="0.083"/>'
-
 
 @pytest.fixture
 def arm(tmp_path):
-    text = '<link name="base"/>'
-    for name, parent, child, x in (("shoulder", "base", "upper", 0), ("elbow", "upper", "lower", 1)):
-        text += f'<link name="{child}"><inertial>{ROD}</inertial></link><joint name="{name}" type="continuous">'
-        text += f'<parent link="{parent}"/><child link="{child}"/><origin xyz="{x} 0 0"/><axis xyz="0 1 0"/></joint>'
-    path = tmp_path / "arm.urdf"
-    path.write_text(f'<robot name="arm">{text}</robot>')
-    return str(path)
+    joints = joint("shoulder", "base", "upper", "continuous") + joint("elbow", "upper", "lower", "continuous")
+    return str(write_urdf(tmp_path, link("upper"), link("lower"), re.sub("<limit.*?/>", "", joints), name="arm"))
 
 
 @pytest.fixture
@@ -137,8 +130,6 @@ MISTAKES = [
     ("solve scene.toml --save no/plan.npz", "folder"),
     ("solve broken.toml", "broken.toml: robot.source"),
 ]
-
-
 USAGE = [
     ("", ("varpin: error", "COMMAND")),
     ("simulat finger", ("varpin: error", "'simulat'", "'simulate'")),

@@ -3,8 +3,6 @@
 Each scene, each integrator and each signal comes up several times in the usual run, every pair with ``--slow``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools
@@ -15,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import zoo
-from oracles import Mechanism, Motion, assert_jet, exact, order_of, slope
+from oracles import Mechanism, Motion, assert_jet, exact, order_of, same, slope
 
 import varpin as vp
 from varpin import wiener
@@ -40,10 +38,6 @@ CONSERVATIVE += ["hand", "springs", "frame springs", "bumpers", "trembling far o
 
 def inertia(case: zoo.Case, q: np.ndarray) -> np.ndarray:
     return Mechanism(case.scene, case.path).mass_matrix(q)
-
-
-def step_state(case: zoo.Case, integrator: vp.Integrator, q: np.ndarray, x: np.ndarray) -> np.ndarray:
-    return np.linalg.solve(inertia(case, q), x) if integrator.variational else x
 
 
 def second(motion: vp.Trajectory, integrator: vp.Integrator) -> np.ndarray:
@@ -426,7 +420,7 @@ class Step:
         """The end (2n,) from (x, u), or the motion."""
         case, n, u = self.case, self.n, z[2 * self.n :]
         q = vp.assemble(case.scene, z[:n]) if case.scene.constraints and case.path is None else z[:n]
-        v = step_state(case, self.integrator, q, z[n : 2 * n])
+        v = np.linalg.solve(inertia(case, q), z[n : 2 * n]) if self.integrator.variational else z[n : 2 * n]
         controls = vp.FirstOrderHold(u.reshape(2, -1)) if self.lines else u
         noise = self.none if dw is None else {"increments": dw[None]}
         end = vp.simulate(
@@ -636,16 +630,6 @@ def test_inputs_between_calls_of_a_law(name):
 # --- records ---------------------------------------------------------------------------------------------------------
 
 
-def same(one: object, other: object) -> bool:
-    if dataclasses.is_dataclass(one):
-        return all(same(getattr(one, own.name), getattr(other, own.name)) for own in dataclasses.fields(one))
-    if isinstance(one, np.ndarray):
-        return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
-    if hasattr(one, "keys"):
-        return list(one) == list(other) and all(same(one[key], other[key]) for key in one)
-    return one == other
-
-
 @over_some
 def test_records(case, integrator, signal, tmp_path):
     motion = motion_of(case, integrator, signal, 2, check=True)
@@ -682,9 +666,11 @@ def test_halves(case, integrator, signal):
     for node in (0, k, 2 * k):
         p = inertia(case, whole.q[node]) @ whole.v[node]
         np.testing.assert_allclose(whole.p[node], p, rtol=0, atol=1e-10 * (1e-12 + np.abs(p).max()))
-    assert same(whole.part(0, k).q, whole.q[: k + 1])
-    A = vp.linearize(case.scene, whole).A
-    assert same(vp.linearize(case.scene, whole.part(k, 2 * k)).A, A[k:])
+    part = whole.part(k, 2 * k)
+    for name in ("q", "v", "p", "energy", "u", "dw", "constraint_forces"):
+        assert same(getattr(part, name), getattr(whole, name)[k:]), name
+    assert same(vp.linearize(case.scene, part).A, vp.linearize(case.scene, whole).A[k:])
+    assert whole.constraint_labels == case.scene.constraint_labels
 
 
 # Without inputs, which move along the lines or cubics of each step, whatever the path between its nodes.

@@ -1,7 +1,5 @@
 """Costs: every term against NumPy and Pinocchio, sums, references, and functions of one's own."""
 
-from __future__ import annotations
-
 import mechanisms
 import numpy as np
 import pinocchio as pin
@@ -418,13 +416,8 @@ def test_what_is_refused_in_the_task(load, make, facts):
         make(robot).bind(Points(np.zeros(2), 1.0, 2, 6, 6, robot=robot))
 
 
-def test_frames_and_robots_that_are_others(load, tmp_path):
+def test_robots_that_are_others(load, tmp_path):
     robot = load("ur5")
-    with refused(vp.UnknownFrame, "'ur5'", "'tool'", "'tool0'") as e:
-        vp.FramePositionCost(robot, "tool", [0, 0, 0])
-    assert "tool0" in e.value.matches
-    with refused(vp.UnknownFrame, "'ur5'", "'[0, 0, 0]'"):
-        vp.FramePositionCost(robot, [0, 0, 0], "tip")
     inertia = '<inertial><mass value="0"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
     light = vp.load_robot(str(mechanisms.arm(tmp_path, inertia)))
     with refused(vp.InputError, "mass"):

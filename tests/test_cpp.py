@@ -101,68 +101,38 @@ def test_the_example_finds_the_core_in_the_tree_and_installed(configured, tmp_pa
 
 
 def test_plan_of_the_example_is_what_python_finds(configured, tmp_path):
+    """Its motions and gains are to the last byte those of its controls, which are an optimum."""
     build = configured("build")
     subprocess.run(["cmake", "--build", build], check=True)
     done = subprocess.run([build / "plan", tmp_path / "found"], check=True, capture_output=True, text=True)
     assert "with feedback" in done.stdout
-    found, expected = np.fromfile(tmp_path / "found"), planned()
-    assert found.size == sum(array.size for array in expected)
-    for array in expected:
-        own, found = found[: array.size], found[array.size :]
-        np.testing.assert_array_equal(own.reshape(array.shape), array)
-
-
-def planned():
-    """What ``examples/cpp/plan.cpp`` writes: controls, nodes q and p, gains, nodes q of the disturbed arm."""
-    N, h, effort, at_goal, at_rest = 100, 0.01, 1e-4, 1e3, 10.0
+    N, n, h, effort, at_goal, at_rest = 100, 6, 0.01, 1e-4, 1e3, 10.0
     start, goal = np.array([0.0, -1.5, 1.5, 0.0, 0.5, 0.0]), np.array([0.6, -1.0, 1.2, -0.4, 0.8, 0.3])
     scene = vp.Scene(vp.load_robot("ur5"), damping=0.5)
-    n = m = 6
-    u0 = scene.holding_torque(start)
+    u, q, p, K, disturbed = np.split(np.fromfile(tmp_path / "found"), np.cumsum([N * n] * 3 + [2 * N * n * n]))
+    u, K = u.reshape(N, n), K.reshape(N, n, 2 * n)
 
     def rollout(q0, controls):
-        return vp.simulate(
-            scene, q0, np.zeros(n), dt=h, steps=N, controls=controls, integrator=vp.Midpoint(), check=False
-        )
+        given = {"dt": h, "steps": N, "controls": controls, "integrator": vp.Midpoint()}
+        return vp.simulate(scene, q0, np.zeros(n), check=False, **given)
 
-    def cost(motion):
-        total = 0.0
-        for off in (motion.u - u0).ravel().tolist():
-            total += 0.5 * h * effort * off * off
-        for off, p in zip((motion.q[-1] - goal).tolist(), motion.p[-1].tolist(), strict=True):
-            total += 0.5 * (at_goal * off * off + at_rest * p * p)
-        return total
-
-    def backward(motion):
-        gradient = np.zeros((N, 2 * n + m))
-        gradient[:, 2 * n :] = effort * (motion.u - u0)
-        hessian = np.diag([0.0] * (2 * n) + [effort] * m)
-        last = np.concatenate([at_goal * (motion.q[-1] - goal), at_rest * motion.p[-1]])
-        lin = vp.linearize(scene, motion)
-        k, K, nothing = np.empty((N, m)), np.empty((N, m, 2 * n)), np.zeros((N, 2 * n, 0))
-        found = {"feedforward": k, "feedback": K, "control_gradient": np.empty((N, m)), "factors": np.empty((N, m, m))}
-        given = {"G": nothing, "Gx": nothing[..., None] * last, "Gu": nothing[..., None] * u0, "hessian": hessian[None]}
-        run = core.BackwardPass(m, last, np.diag([at_goal] * n + [at_rest] * n))
-        arrays = {**given, **found, "spread": np.zeros((0, 2 * n, 2 * n)), "gradient": gradient}
-        assert run.run(h, 1, 0.0, A=lin.A, B=lin.B, **arrays) < 0
-        return k, K
-
-    def policy(u, K, motion):
-        return vp.LinearPolicy(u, K, np.hstack([motion.q, motion.p])[:-1], on="momentum")
-
-    motion = rollout(start, np.tile(u0, (N, 1)))
-    for _ in range(20):
-        before, (k, K) = cost(motion), backward(motion)
-        for halvings in range(10):
-            trial = rollout(start, policy(motion.u + 0.5**halvings * k, K, motion))
-            if cost(trial) < before:
-                motion = trial
-                break
-        if before - cost(motion) < 1e-6 * before:
-            break
-    _, K = backward(motion)
-    followed = rollout(start + 0.05, policy(motion.u, K, motion))
-    return motion.u, motion.q[1:], motion.p[1:], K, followed.q[1:]
+    motion = rollout(start, u)
+    np.testing.assert_array_equal(motion.q[1:].ravel(), q)
+    np.testing.assert_array_equal(motion.p[1:].ravel(), p)
+    pull, off, last = u - scene.holding_torque(start), motion.q[-1] - goal, motion.p[-1]
+    cost = 0.5 * (h * effort * (pull**2).sum() + at_goal * (off**2).sum() + at_rest * (last**2).sum())
+    gradient, end = np.hstack([np.zeros((N, 2 * n)), effort * pull]), np.concatenate([at_goal * off, at_rest * last])
+    lin, nothing = vp.linearize(scene, motion), np.zeros((N, 2 * n, 0))
+    found = {"feedforward": np.empty((N, n)), "feedback": np.empty((N, n, 2 * n)), "control_gradient": np.empty((N, n))}
+    found |= {"factors": np.empty((N, n, n)), "spread": np.zeros((0, 2 * n, 2 * n))}
+    given = {"A": lin.A, "B": lin.B, "G": nothing, "Gx": nothing[..., None] * end, "Gu": nothing[..., None] * goal}
+    given |= {"gradient": gradient, "hessian": np.diag([0.0] * (2 * n) + [effort] * n)[None]}
+    run = core.BackwardPass(n, end, np.diag([at_goal] * n + [at_rest] * n))
+    assert run.run(h, 1, 0.0, **given, **found) < 0
+    assert 0.0 <= -run.slope < 1e-4 * cost
+    np.testing.assert_array_equal(found["feedback"], K)
+    policy = vp.LinearPolicy(u, K, np.hstack([motion.q, motion.p])[:-1], on="momentum")
+    np.testing.assert_array_equal(rollout(start + 0.05, policy).q[1:].ravel(), disturbed)
 
 
 @pytest.mark.parametrize("surroundings", [{}, {"damping": 0.1, "forces": vp.JointStop(100.0)}], ids=["alone", "forces"])

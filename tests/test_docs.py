@@ -2,37 +2,33 @@
 
 import ast
 import inspect
+import os
 import re
 import shlex
-import subprocess
-import sys
-from pathlib import Path
-
-import pytest
-
-import varpin as vp
-from varpin.cli import command
-from varpin.io.scenefile import scenes
-from varpin.simulation import limits
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "docs" / "extensions"))
-import os
 import shutil
+import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import page_code
+import pytest
 
+import varpin as vp
+from varpin.cli import command
 from varpin.core.arrays import Carried, ConstraintRows, Diffusion, Product
 from varpin.integrators import registry
 from varpin.integrators.collocation import Collocation
 from varpin.integrators.tableau import midpoint
+from varpin.io.scenefile import scenes
 from varpin.io.scenefile.kinds import CONSTRAINTS
 from varpin.mechanics import constraints
 from varpin.mechanics.forces import point_of
 from varpin.mechanics.noise import BoundNoise
+from varpin.simulation import limits
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "docs" / "extensions"))
+import page_code
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -45,12 +41,7 @@ MADE = {
     "control-loop.md": ["loop.html"],
     "scenes.md": ["plan.html"],
 }
-NEEDS = {
-    "crocoddyl.md": "crocoddyl",
-    "drake.md": "pydrake",
-    "many-machines.md": "distributed",
-    "mujoco.md": "mujoco",
-}
+NEEDS = {"crocoddyl.md": "crocoddyl", "drake.md": "pydrake", "many-machines.md": "distributed", "mujoco.md": "mujoco"}
 # Pages that run in less than 3 s of processor time; the site runs most others while it is built.
 QUICK = ("drake.md", "mujoco.md", "notebooks.md", "robots.md")
 WIDEST = 96
@@ -64,8 +55,8 @@ def blocks(page, language):
     return re.findall(rf"^```{language}\n(.*?)^```$", text_of(page), re.M | re.S)
 
 
-def run(*words, cwd):
-    done = subprocess.run([sys.executable, *words], cwd=cwd, capture_output=True, text=True, check=False)
+def run(*words, cwd, **options):
+    done = subprocess.run([sys.executable, *words], cwd=cwd, capture_output=True, text=True, check=False, **options)
     assert done.returncode == 0, done.stderr
     return done
 
@@ -258,11 +249,6 @@ def test_the_list_of_slow_tests_names_tests(request):
     assert names <= {item.nodeid for item in request.session.items}
 
 
-def test_the_readme_has_only_blocks_that_are_run():
-    assert set(re.findall(r"^```(\w+)$", text_of(README), re.M)) == {"python", "bash", "text"}
-    assert len(blocks(README, "bash")) == 2
-
-
 @pytest.mark.parametrize("number", range(len(blocks(README, "python"))))
 def test_a_block_of_the_readme_runs(number, tmp_path):
     code = blocks(README, "python")[number]
@@ -283,15 +269,14 @@ def test_a_block_of_the_readme_runs(number, tmp_path):
 
 def test_the_readme_s_main_command(tmp_path):
     """The first command's own work, with this interpreter for the one it installs; .ci/run runs it whole."""
-    words = blocks(README, "bash")[0].replace("\\\n", " ").split("&& .venv/bin/varpin ")[1]
+    assert set(re.findall(r"^```(\w+)$", text_of(README), re.M)) == {"python", "bash", "text"}
+    first, _ = blocks(README, "bash")
+    words = first.replace("\\\n", " ").split("&& .venv/bin/varpin ")[1]
     run("-m", "varpin", *words.split(), cwd=tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"finger.html", "finger.npz", "finger.png"}
 
 
 # --- what docs/extending.md says, done: a class of one's own, and nothing else, is enough ----------------------------
-
-
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -376,20 +361,15 @@ def test_a_noise_kicks_what_it_says():
     np.testing.assert_allclose(mine.q, theirs.q, atol=1e-14)
 
 
-def parts_of_page(language):
-    return re.findall(rf"^```{language}\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.M | re.S)
-
-
 @pytest.mark.slow
 def test_a_force_of_the_core_is_a_struct_and_its_name(tmp_path):
-    root = PAGE.parents[1]
     for name in ("src", "models"):
-        shutil.copytree(root / name, tmp_path / name, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(root / name, tmp_path)
+        shutil.copy(ROOT / name, tmp_path)
     header = tmp_path / "src" / "core" / "include" / "varpin" / "forces.hpp"
     before, listed, after = re.split(r"(^using Element =[^;]*;\n)", header.read_text(encoding="utf-8"), flags=re.M)
-    struct, kinds = parts_of_page("cpp")
+    struct, kinds = blocks("extending.md", "cpp")
     assert kinds.split() == listed.replace(">;", ", RubberBush>;").split(), "the page has another list of kinds"
     header.write_text(before + struct + kinds + after, encoding="utf-8")
     settings = {"build-type": "Plain", "define.CMAKE_UNITY_BUILD": "ON", "define.VARPIN_FEW_SIZES": "ON"}
@@ -399,29 +379,21 @@ def test_a_force_of_the_core_is_a_struct_and_its_name(tmp_path):
     (wheel,) = (tmp_path / "wheel").iterdir()
     shutil.unpack_archive(wheel, tmp_path / "built", "zip")
     script = tmp_path / "page.py"
-    script.write_text("\n".join(parts_of_page("python")) + (PAGE.parents[1] / "tests" / "added_force.py").read_text())
-    done = subprocess.run(
-        [sys.executable, script],
-        env=os.environ | {"PYTHONPATH": str(tmp_path / "built")},
-        check=False,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
+    checks = (ROOT / "tests" / "added_force.py").read_text()
+    script.write_text("\n".join(blocks("extending.md", "python")) + checks)
+    run(script, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(tmp_path / "built")})
 
 
 def test_the_page_names_files_that_are_there():
-    root = PAGE.parents[1]
-    text = PAGE.read_text(encoding="utf-8")
-    found = {path.name for path in (root / "src").rglob("*.*")} | {path.name for path in (root / "tests").iterdir()}
-    named = {name.rpartition("/")[2] for name in re.findall(r"`([\w/]+\.(?:py|hpp|cpp))`", text)}
+    found = {path.name for path in (ROOT / "src").rglob("*.*")} | {path.name for path in (ROOT / "tests").iterdir()}
+    named = {name.rpartition("/")[2] for name in re.findall(r"`([\w/]+\.(?:py|hpp|cpp))`", text_of("extending.md"))}
     assert named
     assert named <= found
 
 
 def test_q0_takes_the_way_that_the_page_says():
     """Its Python functions are called in its order."""
-    listed = re.search(r"\*\*`q0` from(.*?)\*\*A torque", PAGE.read_text(encoding="utf-8"), re.S).group(1)
+    listed = re.search(r"\*\*`q0` from(.*?)\*\*A torque", text_of("extending.md"), re.S).group(1)
     way = re.findall(r"^\d+\. `([\w/]+\.\w+)`: (?:`(\w+)`)?", listed, re.M)
     assert len({file for file, _ in way}) == 12
     assert way[8] == ("jet.hpp", "lagrangian_jet")

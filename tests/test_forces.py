@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 from findings import about
 from oracles import Mechanism, slope
-from refusals import naming, refused, unnamed
+from refusals import refused, unnamed
 
 import varpin as vp
 
@@ -215,42 +215,22 @@ def test_light_parts_balance_with_springs(ends):
     assert motion.statistics.split_steps == 0
 
 
-REST = [0.0, -1.0, 1.0, -0.5, 0.8, 0.0]
-
-
-@pytest.fixture(scope="module")
-def served():
+def test_servos_that_are_told_nothing_stay(tmp_path):
+    """They give way to gravity alone, by what a spring would; in ensembles, too."""
     scene = vp.Scene(vp.load_robot("ur5"), forces=[vp.PositionServo(2000.0, 200.0)])
-    return scene, vp.simulate(scene, REST, np.zeros(6), dt=1e-3, steps=200, integrator=vp.Radau(3))
-
-
-def test_servos_that_are_told_nothing_stay(served):
-    scene, motion = served
-    np.testing.assert_array_equal(motion.u, np.tile(REST, (200, 1)))
-    # They give way to gravity alone, by what a spring would.
-    sag = scene.holding_torque(REST) / 2000.0
-    assert np.abs(motion.q - REST).max() < 2.0 * np.abs(sag).max()
-
-
-def test_ensembles_and_advice_take_the_same(served):
-    scene, motion = served
-    paths = vp.simulate_ensemble(scene, REST, np.zeros(6), dt=1e-3, steps=200, paths=1, rng=0, integrator=vp.Radau(3))
+    rest, still = [0.0, -1.0, 1.0, -0.5, 0.8, 0.0], np.zeros(6)
+    run = {"dt": 1e-3, "steps": 200, "integrator": vp.Radau(3)}
+    motion = vp.simulate(scene, rest, still, **run)
+    np.testing.assert_array_equal(motion.u, np.tile(rest, (200, 1)))
+    sag = scene.holding_torque(rest) / 2000.0
+    assert np.abs(motion.q - rest).max() < 2.0 * np.abs(sag).max()
+    paths = vp.simulate_ensemble(scene, rest, still, paths=1, rng=0, **run)
     np.testing.assert_allclose(paths.statistics.mean[-1, :6], motion.q[-1], rtol=0, atol=1e-12)
     with refused(vp.InputError, "controls", "servos"):
-        vp.simulate_ensemble(scene, [REST, np.zeros(6)], np.zeros(6), dt=1e-3, steps=2, paths=2, rng=0)
-
-
-def test_commands_are_not_coloured_as_torques(served, tmp_path):
-    scene, motion = served
+        vp.simulate_ensemble(scene, [rest, still], still, paths=2, rng=0, **run)
+    # Commands are not coloured as torques.
     with refused(vp.InputError, "controls", "servos"):
         vp.replay(scene.robot, motion, html=tmp_path / "served.html", marks=vp.Marks(torques=True))
-
-
-def test_gravity_in_millimetres_is_told(caplog):
-    vp.Scene(vp.planar_chain(1), gravity=[0.0, 0.0, -24.8])
-    assert not caplog.messages
-    vp.Scene(vp.planar_chain(1), gravity=[0.0, 0.0, -9810.0])
-    assert len(naming(caplog.messages, "gravity", "-9810.0", "mm/s^2")) == 1
 
 
 # --- those that a user writes ----------------------------------------------------------------------------------------

@@ -1,7 +1,5 @@
 """What integrates a motion where nobody says what; and dry friction that is too fast for steps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -29,14 +27,17 @@ def test_friction_never_adds_energy(integrator, width):
         assert np.diff(motion.energy).max() <= 1e-14
 
 
+LEVELS = [8.0, 8.0, 5.0, 2.0, 2.0, 1.0]
+BEGIN, SPEED = np.array([0.0, -1.2, 1.5, -0.5, 0.3, 0.2]), np.array([1.0, 1.0, -1.0, 1.0, 2.0, 2.0])
+
+
 def test_friction_so_fast_that_steps_take_very_short_parts():
-    scene = vp.Scene(vp.load_robot("ur5"), forces=vp.CoulombFriction([8.0, 8.0, 5.0, 2.0, 2.0, 1.0], 1e-5))
-    begin, speed = np.array([0.0, -1.2, 1.5, -0.5, 0.3, 0.2]), np.array([1.0, 1.0, -1.0, 1.0, 2.0, 2.0])
-    stopped = vp.simulate(scene, begin, speed, dt=1e-2, steps=60, integrator=vp.Radau(3))
+    scene = vp.Scene(vp.load_robot("ur5"), forces=vp.CoulombFriction(LEVELS, 1e-5))
+    stopped = vp.simulate(scene, BEGIN, SPEED, dt=1e-2, steps=60, integrator=vp.Radau(3))
     assert stopped.statistics.halvings.max() > 12
     assert stopped.statistics.substeps.max() < 100
     assert np.abs(stopped.v[10:, 5]).max() < 1e-3
-    motion = vp.simulate(scene, begin, speed, dt=2e-2, steps=30, integrator=vp.RungeKutta4())
+    motion = vp.simulate(scene, BEGIN, SPEED, dt=2e-2, steps=30, integrator=vp.RungeKutta4())
     # Friction holds the last joint after 0.08 s.
     assert np.abs(motion.v[5:, 5]).max() > 0.3
     assert about(motion.warnings, "error")
@@ -161,13 +162,10 @@ def test_noise_beyond_the_width_of_friction_is_reported():
 
 
 def test_an_arm_comes_to_rest():
-    robot = vp.load_robot("ur5")
-    scene = vp.Scene(robot, gravity=False, forces=vp.CoulombFriction([8.0, 8.0, 5.0, 2.0, 2.0, 1.0], 1e-2))
-    begin, speed = np.array([0.0, -1.2, 1.5, -0.5, 0.3, 0.2]), np.array([1.0, 1.0, -1.0, 1.0, 2.0, 2.0])
-
-    true = exact(scene, begin, speed, np.linspace(0.0, 0.6, 13), stiff=True, rtol=1e-8).q
+    scene = vp.Scene(vp.load_robot("ur5"), gravity=False, forces=vp.CoulombFriction(LEVELS, 1e-2))
+    true = exact(scene, BEGIN, SPEED, np.linspace(0.0, 0.6, 13), stiff=True, rtol=1e-8).q
     for integrator, error in ((vp.Radau(3), 2e-6), (vp.Gauss(3), 2e-6), (vp.Midpoint(), 2e-5)):
-        motion = vp.simulate(scene, begin, speed, dt=1e-3, steps=600, integrator=integrator)
+        motion = vp.simulate(scene, BEGIN, SPEED, dt=1e-3, steps=600, integrator=integrator)
         np.testing.assert_allclose(motion.q[::50], true, atol=error)
         assert np.abs(motion.v[-1]).max() < 1e-6
         assert np.diff(motion.energy).max() <= 1e-12 * motion.energy[0]

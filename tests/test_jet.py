@@ -1,7 +1,5 @@
 """The Lagrangian against Pinocchio, and steps of large trees, solved from the leaves to the roots."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -12,13 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mechanisms import random_tree
-from oracles import assert_jet, slope
+from oracles import assert_jet, assert_same_jet, slope
 from refusals import refused
 
 import varpin as vp
 from varpin import textbook
-
-NAMES = ("Lq", "Lv", "Lqq", "Lvq", "Lvv")
 
 
 def busy_scene(robot: vp.Robot, rng: np.random.Generator) -> vp.Scene:
@@ -28,19 +24,12 @@ def busy_scene(robot: vp.Robot, rng: np.random.Generator) -> vp.Scene:
     )
 
 
-def assert_close(actual: np.ndarray, expected: np.ndarray, rtol: float, what: str, scale: float = 0.0) -> None:
-    """Agreement to ``rtol`` of the largest entry, or of ``scale`` where everything might vanish."""
-    scale = max(scale, np.abs(expected).max())
-    np.testing.assert_allclose(actual, expected, rtol=0, atol=rtol * scale, err_msg=what)
-
-
 def test_compiled_is_what_pinocchio_computes(robot):
     q, v = np.random.default_rng(0).normal(0.0, 2.0, (2, robot.dof))
     scene = busy_scene(robot, np.random.default_rng(1))
     compiled = vp.lagrangian_jet(scene, q, v)
     reference = vp.lagrangian_jet(scene, q, v, backend="pinocchio")
-    for name in NAMES:
-        assert_close(getattr(compiled, name), getattr(reference, name), 1e-12, name)
+    assert_same_jet(compiled, reference)
     kinetic = 0.5 * v @ reference.Lvv @ v
     assert abs(compiled.L - reference.L) <= 1e-12 * (kinetic + abs(kinetic - reference.L))
 
@@ -66,8 +55,7 @@ def test_a_base_ten_kilometres_away_costs_no_digits(load, name):
             model.jointPlacements[joint] = pin.SE3(placement.rotation, moved)
     q, v = np.random.default_rng(0).normal(size=(2, near.dof))
     here, there = (vp.lagrangian_jet(vp.Scene(own), q, v) for own in (near, vp.load_robot(model)))
-    for entry in NAMES:
-        assert_close(getattr(there, entry), getattr(here, entry), 1e-12, entry)
+    assert_same_jet(there, here)
 
 
 def test_exact_zeros_between_branches():
@@ -120,11 +108,6 @@ def tree(request):
     return ROBOTS[request.param]()
 
 
-def scene_of(tree):
-    friction = vp.CoulombFriction(FRICTION, width=0.5)
-    return vp.Scene(tree, stiffness=0.3, rest=0.1, damping=DAMPING, friction=0.0, forces=friction)
-
-
 def state_of(tree, seed=2):
     rng = np.random.default_rng(seed)
     return 0.3 * rng.uniform(-2.0, 2.0, tree.dof), 0.2 * rng.normal(size=tree.dof)
@@ -136,7 +119,9 @@ def jet_of(scene, q, v):
 
 def test_steps_solve_their_equation(tree):
     """(S1) of docs/mathematics.md, by Pinocchio's matrices."""
-    scene, (q, v), u = scene_of(tree), state_of(tree), 0.1 * np.cos(np.arange(tree.dof))
+    friction = vp.CoulombFriction(FRICTION, width=0.5)
+    scene = vp.Scene(tree, stiffness=0.3, rest=0.1, damping=DAMPING, friction=0.0, forces=friction)
+    (q, v), u = state_of(tree), 0.1 * np.cos(np.arange(tree.dof))
     motion = vp.simulate(scene, q, v, dt=H, steps=1, controls=u, integrator=vp.Midpoint(), check=False)
     assert motion.statistics.substeps.tolist() == [1]
     assert motion.statistics.residual.max() <= 100.0

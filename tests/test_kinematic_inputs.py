@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import zoo
 from numpy.testing import assert_allclose
-from oracles import exact, least_cost, lines, slope
+from oracles import exact, lines, slope
 from plan_problems import hand
 from refusals import refused
 
@@ -61,14 +61,6 @@ def swing(interpolation, dt, steps, **options):
         cost = vp.VelocityCost([0.0, 0.05]) + vp.ControlRateCost(0.05, before=[BEGIN[0]])
     cost += vp.Terminal(vp.TrackingCost(GOAL, 100.0) + vp.VelocityCost(10.0 if cubic else [0.0, 10.0]))
     return vp.OptimalControlProblem(scene, cost, BEGIN, np.zeros(2), dt=dt, steps=steps, **options)
-
-
-@over_interpolations
-def test_a_plan_by_hand_is_scipy_s(interpolation):
-    problem = swing(interpolation, 0.1, 4)
-    plan = vp.solve(problem, tolerance=1e-10)
-    start = plan.controls + 0.03 * np.random.default_rng(0).normal(size=plan.controls.shape)
-    assert plan.cost == pytest.approx(least_cost(problem, start), rel=1e-6)
 
 
 @pytest.mark.parametrize(("interpolation", "dt", "steps"), [("linear", 0.02, 60), ("cubic", 0.08, 15)])
@@ -239,10 +231,6 @@ def rate(t):
     return 1.2 * np.cos(3.0 * t)
 
 
-def torque(t):
-    return 1.5 * np.sin(5.0 * t + 0.4)
-
-
 def arm(interpolation):
     hand = vp.KinematicInput("joint1", interpolation)
     return vp.Scene(vp.planar_chain(3), actuation=["joint1", "joint2"], constraints=hand)
@@ -250,42 +238,27 @@ def arm(interpolation):
 
 def wanted(scene, t):
     cubic = [rate(t)] if scene.controls == 3 else []
-    return np.array([path(t), torque(t), *cubic])
+    return np.array([path(t), 1.5 * np.sin(5.0 * t + 0.4), *cubic])
 
 
 Q0, V0 = np.array([path(0.0), 0.5, -0.4]), np.array([rate(0.0), 0.0, 0.0])
 
 
-def test_a_motion_under_a_function_of_time_is_linearized():
-    scene = arm("cubic")
-    begin = wanted(scene, 0.01)
+@pytest.mark.parametrize("divided", [False, True], ids=["a function of time", "in parts"])
+def test_steps_are_linearized(divided):
+    scene, dt, v0 = arm("cubic"), 0.2 if divided else 0.01, [V0[0], 0.0, 8.0 * divided]
+    begin = np.array([path(dt), 20.0, rate(dt)]) if divided else wanted(scene, dt)
 
     def step(u):
-        controls = vp.OpenLoop(lambda t: u + np.array([0.0, 3.0 * t, 0.0]))
-        return vp.simulate(scene, Q0, V0, dt=0.01, steps=1, controls=controls, integrator=vp.Gauss(2), check=False)
-
-    lin = vp.linearize(scene, step(begin))
+        controls = u[None] if divided else vp.OpenLoop(lambda t: u + np.array([0.0, 3.0 * t, 0.0]))
+        return vp.simulate(scene, Q0, v0, dt=dt, steps=1, controls=controls, integrator=vp.Gauss(2), check=False)
 
     def end(u):
-        return np.append(step(u).q[1], step(u).p[1])
-
-    for c, size in enumerate((1e-4, 1e-2, 1e-2)):
-        found = slope(end, begin, np.eye(3)[c], size)
-        assert_allclose(lin.B[0, :, c], found, atol=1e-8 * np.abs(lin.B[0]).max())
-
-
-def test_a_divided_step_is_linearized_in_the_rate():
-    scene, begin = arm("cubic"), np.array([path(0.2), 20.0, rate(0.2)])
-
-    def step(u):
-        options = {"dt": 0.2, "steps": 1, "integrator": vp.Gauss(2), "check": False}
-        return vp.simulate(scene, Q0, [V0[0], 0.0, 8.0], controls=u[None], **options)
-
-    def end(u):
-        return np.append(step(u).q[1], step(u).p[1])
+        moved = step(u)
+        return np.append(moved.q[1], moved.p[1])
 
     motion = step(begin)
-    assert motion.statistics.substeps[0] > 1
+    assert (motion.statistics.substeps[0] > 1) == divided
     slopes = np.transpose([slope(end, begin, e, 1e-4) for e in np.eye(3)])
     assert_allclose(vp.linearize(scene, motion).B[0], slopes, atol=1e-8 * np.abs(slopes).max())
 
@@ -376,23 +349,17 @@ def test_noise_of_the_position_of_an_input_is_differentiated_at_the_end_of_the_s
         check=True,
     )
     problem = hand("linear", steps=1, noise=own)
-    u, step = np.array([0.1, -0.2, 0.3, 0.5, 0.1, -0.3]), 1e-5
+    u = np.array([0.1, -0.2, 0.3, 0.5, 0.1, -0.3])
+    lin = vp.linearize(problem.scene, problem.simulate(lines(problem, u.reshape(2, 3))))
 
-    def linearized(ends):
-        return vp.linearize(problem.scene, problem.simulate(lines(problem, ends.reshape(2, 3))))
+    def fields(u):
+        """Of the mean over the step, and of the slope."""
+        mean, last = 0.5 * (u[1] + u[4]), u[3]
+        return np.array([[0.0, last * mean, last**2], [0.0, last * (u[4] - u[1]) / np.sqrt(12.0), 0.0]]).T
 
-    lin = linearized(u)
-    first = lin.F[0, :, 0]
-    assert_allclose(first, [0.0, u[3] * 0.5 * (u[1] + u[4]), u[3] ** 2], atol=1e-12)
-    slope = np.array([0.0, u[3] * (u[4] - u[1]), 0.0]) / np.sqrt(12.0)
-    assert_allclose(lin.G[0], lin.J[0] @ np.stack([first, slope], axis=1), atol=1e-12)
-    for c in range(6):
-        away = step * np.eye(6)[c]
+    assert_allclose(lin.F[0, :, 0], fields(u)[:, 0], atol=1e-12)
+    assert_allclose(lin.G[0], lin.J[0] @ fields(u), atol=1e-12)
+    for c, e in enumerate(np.eye(6)):
         # The Jacobian of the step stays: it is the fields that are differentiated.
-        fields = []
-        for at in (u + away, u - away):
-            mean, last = 0.5 * (at[1] + at[4]), at[3]
-            fields.append(np.array([[0.0, last * mean, last**2], [0.0, last * (at[4] - at[1]) / np.sqrt(12.0), 0.0]]).T)
-        expected = lin.J[0] @ (fields[0] - fields[1]) / (2.0 * step)
         found = (lin.Gramp if c >= 3 else lin.Gu - lin.Gramp)[0, :, :, c % 3]
-        assert_allclose(found, expected, atol=1e-8)
+        assert_allclose(found, lin.J[0] @ slope(fields, u, e, 1e-3), atol=1e-8)

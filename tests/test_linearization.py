@@ -129,10 +129,6 @@ ARMS = {
 }
 
 
-def velocity(scene, q, p):
-    return np.linalg.solve(vp.lagrangian_jet(scene, q, np.zeros_like(q)).Lvv, p)
-
-
 def parts_of(motion):
     """The halvings of each step, none for one that was taken whole."""
     counts = np.where(motion.statistics.substeps > 1, motion.statistics.substeps, 0)
@@ -142,9 +138,9 @@ def parts_of(motion):
 def composed(scene, integrator, dt, halvings, q, p, u):
     plain = type(integrator)(**{**vars(integrator), "guard": None})
     for level in halvings:
-        step = vp.simulate(
-            scene, q, velocity(scene, q, p), dt=dt / 2.0**level, steps=1, controls=u, integrator=plain, check=False
-        )
+        v = np.linalg.solve(vp.lagrangian_jet(scene, q, np.zeros_like(q)).Lvv, p)
+        given = {"dt": dt / 2.0**level, "steps": 1, "controls": u, "integrator": plain}
+        step = vp.simulate(scene, q, v, check=False, **given)
         q, p = step.q[1], step.p[1]
     return np.concatenate([q, p])
 
@@ -370,18 +366,6 @@ def test_scenes_that_are_alike_are_the_same(load, tmp_path):
     kicked = motion_of(vp.Scene(load("ur5"), **UR5), rng=0)
     with refused(vp.InputError, "noise"):
         vp.linearize(stronger, kicked)
-
-
-def test_plans_in_files_keep_their_scene(tmp_path):
-    scene = vp.Scene(vp.planar_chain(2), damping=0.3)
-    cost = vp.ControlCost(1.0) + vp.Terminal(vp.TrackingCost([0.1, 0.1]))
-    problem = vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], dt=0.02, steps=5)
-    plan = vp.solve(problem, max_iterations=2)
-    path = plan.save(tmp_path / "plan.npz")
-    for motion in (vp.Solution.load(path, problem).trajectory, vp.Trajectory.load(path)):
-        assert vp.linearize(scene, motion).steps == 5
-        with refused(vp.InputError, "damping"):
-            vp.linearize(vp.Scene(vp.planar_chain(2)), motion)
 
 
 def test_a_checked_linearization_has_a_verdict():

@@ -1,7 +1,5 @@
 """Meshes are found beside the file and in packages, and mean in every use what their files say."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """MJCF files load as MuJoCo reads them: accelerations, limits, places, shapes, and equality constraints."""
 
-from __future__ import annotations
-
 import pickle
 import sys
 
@@ -294,8 +292,6 @@ ARM = (
     f'</body><body name="ay" pos="0.3 0.2 0.4">{joints("c", -0.1)}{MASS}{SITE.format("tool")}</body>'
     f"{SITE.format('mark')}"
 )
-
-
 FLAGS = '<option><flag contact="disable" limit="disable"/></option>'
 
 

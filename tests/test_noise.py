@@ -1,7 +1,5 @@
 """Diffusion fields, Wiener increments, order and laws of motions under noise; noise that is held, or forgotten."""
 
-from __future__ import annotations
-
 import logging
 
 import numpy as np
@@ -23,11 +21,6 @@ ACTUATION = np.array([[1.0, 0.0], [0.0, 0.0], [0.5, 2.0]])
 
 def chain(noise, links=2, **options):
     return vp.Scene(vp.planar_chain(links), noise=noise, **options)
-
-
-def points(n=3, m=2, count=5):
-    rng = np.random.default_rng(0)
-    return rng.normal(size=(count, n)), rng.normal(size=(count, n)), rng.normal(size=(count, m)), rng.normal(size=n)
 
 
 def difference(function, x):
@@ -87,7 +80,8 @@ MODELS = {
 def test_fields_are_as_defined_and_have_their_derivatives(name):
     model, expected = MODELS[name]
     bound = vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=model).noise
-    q, v, u, start = points()
+    rng = np.random.default_rng(0)
+    q, v, u, start = rng.normal(size=(5, 3)), rng.normal(size=(5, 3)), rng.normal(size=(5, 2)), rng.normal(size=3)
     fields = bound.fields(q, v, u, start)
     exact = np.array([expected(*point, start) for point in zip(q, v, u, strict=True)])
     assert fields.F.shape == exact.shape == (5, 3, bound.processes)
@@ -226,10 +220,6 @@ SPLIT = vp.Midpoint(kick="split")
 BOTH = pytest.mark.parametrize("kick", ["left", "split"])
 
 
-def noisy_chain(noise):
-    return vp.Scene(vp.planar_chain(2), damping=0.3, stiffness=4.0, noise=noise)
-
-
 def test_increments_are_normal_with_variance_dt():
     dt, samples = 0.02, 400_000
     dw = wiener_increments(2, dt, samples // 2, rng=0)
@@ -274,7 +264,7 @@ NOISES = {
 @pytest.mark.parametrize("name", NOISES)
 def test_strong_order_one(name, kick):
     """Mean over 200 paths of the largest error at common nodes, against 1/64 of the step on the same Brownian path."""
-    scene, integrator = noisy_chain(NOISES[name]), vp.Midpoint(kick=kick)
+    scene, integrator = chain(NOISES[name], damping=0.3, stiffness=4.0), vp.Midpoint(kick=kick)
     duration, coarse, finest = 0.5, 32, 64
     # The same control function of time at every step size.
     u = np.array([[np.cos(3.0 * k / coarse), np.sin(5.0 * k / coarse)] for k in range(coarse)])
@@ -376,12 +366,8 @@ def test_the_force_acts_like_a_control_of_the_step(kind, guard, servo):
     assert (motion.statistics.split_steps > 0) == (guard is not None)
     for name in ("q", "p", "energy"):
         np.testing.assert_allclose(getattr(motion, name), getattr(same, name), rtol=0, atol=1e-10 if servo else 1e-12)
-    np.testing.assert_allclose(
-        motion.statistics.energy_defect,
-        same.statistics.energy_defect,
-        rtol=0,
-        atol=1e-10 * np.abs(same.energy).max(),
-    )
+    defects, size = (each.statistics.energy_defect for each in (motion, same)), np.abs(same.energy).max()
+    np.testing.assert_allclose(*defects, rtol=0, atol=1e-10 * size)
 
 
 OF_VELOCITIES = [
@@ -507,14 +493,6 @@ def test_noise_that_is_not_drawn_is_told_of_once(noise, check, caplog):
 @pytest.mark.parametrize("meant", [{"rng": 0}, {"increments": 0}, {"increments": np.zeros((20, 2))}], ids=str)
 def test_what_is_meant_is_not_told_of(meant):
     assert vp.simulate(noisy(), [0, 0], [0, 0], **SHORT, **meant).warnings == ()
-
-
-def test_no_increments_are_the_motion_without_noise():
-    quiet = vp.simulate(QUIET, [0.1, 0.2], [0, 0], **SHORT)
-    told = vp.simulate(noisy(), [0.1, 0.2], [0, 0], **SHORT, increments=0)
-    np.testing.assert_allclose(told.q, quiet.q, rtol=0.0, atol=1e-14)
-    with refused(vp.InputError, "increments", "(20, 2)"):
-        vp.simulate(noisy(), [0.1, 0.2], [0, 0], **SHORT, increments=1.0)
 
 
 def test_paths_that_are_all_one_and_seeds_of_nothing_are_told_of():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from findings import about
 from numpy.testing import assert_allclose, assert_array_equal
-from oracles import lines
+from oracles import lines, slope
 from plan_problems import linear
 
 import varpin as vp
@@ -192,7 +192,7 @@ def test_the_effect_of_noise_along_a_line(noise, kick):
     integrator = vp.Gauss(2, kick=kick)
     problem = reach(noise, steps=1, integrator=integrator, controls="linear").at(q0=[0.3, -0.2], v0=[0.4, 0.7])
     scene, n, left = problem.scene, 2, integrator.left
-    at, size = np.array([1.0, -2.0, 3.0, 0.5]), 1e-4
+    at = np.array([1.0, -2.0, 3.0, 0.5])
     motion = problem.simulate(lines(problem, at.reshape(2, 2)))
     lin = vp.linearize(scene, motion)
 
@@ -203,9 +203,9 @@ def test_the_effect_of_noise_along_a_line(noise, kick):
             return scene.noise.fields(moved.q[k, None], moved.v[k, None], u[None], problem.q0).F[0]
 
         def columns(k):
-            slope = (fields(k, ends[2:]) - fields(k, ends[:2])) / np.sqrt(12.0)
+            sloped = (fields(k, ends[2:]) - fields(k, ends[:2])) / np.sqrt(12.0)
             # Noise of the state's alone sees no slope.
-            return np.hstack([fields(k, 0.5 * (ends[:2] + ends[2:])), slope[:, np.abs(slope).any(axis=0)]])
+            return np.hstack([fields(k, 0.5 * (ends[:2] + ends[2:])), sloped[:, np.abs(sloped).any(axis=0)]])
 
         before, after = columns(0), columns(1)
         found = left * lin.J[0] @ before
@@ -214,9 +214,8 @@ def test_the_effect_of_noise_along_a_line(noise, kick):
 
     assert_allclose(lin.G[0], effect(at), atol=1e-12)
     derivatives = np.concatenate([lin.Gu - lin.Gramp, lin.Gramp], axis=3)[0]
-    for c, away in enumerate(size * np.eye(4)):
-        found = (effect(at + away) - effect(at - away)) / (2.0 * size)
-        assert_allclose(derivatives[:, :, c], found, atol=1e-8)
+    for c, e in enumerate(np.eye(4)):
+        assert_allclose(derivatives[:, :, c], slope(effect, at, e, 1e-3), atol=1e-8)
 
 
 def test_strong_noise_costs_what_the_plan_expects_in_fine_steps():
@@ -270,9 +269,8 @@ def test_the_drift_along_a_line_is_its_mean_over_the_step(integrator):
     problem = reach(sliding, steps=1, integrator=integrator, controls="linear").at(q0=[0.3, -0.2], v0=[0.4, 0.7])
     scene, u = problem.scene, np.array([1.0, -2.0, -3.0, 4.0])
 
-    def ends(x, u):
-        at = problem.at(q0=x[:2], v0=x[2:])
-        motion = at.simulate(lines(at, u.reshape(2, 2)))
+    def end(u):
+        motion = problem.simulate(lines(problem, u.reshape(2, 2)))
         return np.concatenate([motion.q[1], motion.p[1] if integrator.variational else motion.v[1]])
 
     def local(control, ends=None):
@@ -284,7 +282,6 @@ def test_the_drift_along_a_line_is_its_mean_over_the_step(integrator):
     assert_allclose(found, (local(u[:2]) + 4.0 * local(mean) + local(u[2:])) / 6.0, atol=1e-14)
     assert np.abs(found - local(mean)).max() > 1e-2
     lin = vp.linearize(scene, problem.simulate(lines(problem, u.reshape(2, 2))))
-    x, step = np.concatenate([problem.q0, problem.v0]), 1e-5
     by_control = np.concatenate([lin.B - lin.ramp, lin.ramp], axis=2)[0]
-    for c, away in enumerate(step * np.eye(4)):
-        assert_allclose(by_control[:, c], (ends(x, u + away) - ends(x, u - away)) / (2 * step), atol=1e-8)
+    for c, e in enumerate(np.eye(4)):
+        assert_allclose(by_control[:, c], slope(end, u, e, 1e-3), atol=1e-8)

@@ -9,7 +9,6 @@ from findings import about
 from refusals import naming, unnamed
 
 import varpin as vp
-from varpin.control.checks import findings
 from varpin.io.scenefile import scenes
 
 ARMS = ("ur5", "ur10", "xarm7", "panda", "z1")
@@ -103,14 +102,6 @@ def test_ctrl_c_ends_the_look_and_not_the_plan(monkeypatch):
     assert about(plan.warnings[0], "interrupted")
 
 
-def test_warnings_go_through_files(tmp_path):
-    plan = vp.solve(reach(vp.planar_chain(2), 3, steps=20, dt=0.05, integrator=vp.ExplicitEuler()))
-    assert plan.warnings
-    again = vp.Solution.load(plan.save(tmp_path / "plan.npz"), plan.problem)
-    assert again.warnings == plan.warnings
-    assert findings(again) == plan.warnings
-
-
 def small(cost=None, **options):
     cost = vp.ControlCost(0.1) + vp.Terminal(vp.TrackingCost([0.0])) if cost is None else cost
     given = {"q0": [0.0], "v0": [0.0], "dt": 0.05, "steps": 10, **options}
@@ -163,6 +154,8 @@ FIXED, ACROSS = vp.Terminal(vp.FramePositionCost(LINK, "tip", (1.0, 0.0, 0.0))),
         (joints(-10.0, 3.0), "limits in degrees", 0, ()),
         (joints(-1.0, -0.2), "goal outside constraints", 1, ("joint1", "0.2 rad", "WithinJointLimits")),
         (joints(-1.0, 0.1), "goal outside constraints", 0, ()),
+        (joints(-0.2, 3.0), "start outside constraints", 1, ("lower limit of joint1", "0.3 rad", "WithinJointLimits")),
+        (joints(-1.0, 3.0), "start outside constraints", 0, ()),
         ({"constraints": CLEAR}, "start outside constraints", 1, ("joint1", "table", "0.01")),
         (goal(1.1), "goal out of reach", 1, ("1.1 m", "1 m")),
         (goal(0.9), "goal out of reach", 0, ()),

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from plan_problems import CAPSULES, REST, SMALL, TWO, linear, reach, small, wave
-from refusals import refused
+from refusals import refused, unnamed
+from zoo import ZOO
 
 import varpin as vp
 from varpin import wiener
@@ -162,8 +163,6 @@ OF_CONTROLLERS = [
     (lambda: mpc().plan(0.05, np.zeros(3), np.zeros(3), None, -1), ("decisions", "-1")),
     (lambda: vp.Plant(wave().scene, "rk"), "integrator"),
 ]
-
-
 OF_TIMES = [
     (lambda: small(dt=None, steps=None), "two of dt"),
     (lambda: small(duration=1.0), "two of dt"),
@@ -188,6 +187,11 @@ OF_ROBOTS = [
     (ur5(keep="elbow_joint"), "keep"),
     (ur5(keep={"elbow_joint": 0.0}), "keep"),
     (ur5(keep=["elbow_joint"], lock={"elbow_joint": 0.1}), ("'elbow_joint'", "keep", "lock")),
+    (lambda: vp.load_robot("panda", keep=["panda_finger_joint2"]), ("panda_finger_joint2", "panda_finger_joint1")),
+    (
+        lambda: vp.load_robot("panda", lock={"panda_finger_joint2": 0.0}),
+        ("'panda_finger_joint2'", "'panda_finger_joint1'"),
+    ),
     (ur5(base="round"), ("base", "'planar'", "'round'")),
     (ur5(base=np.eye(3)), ("base", "(3, 3)")),
     (ur5(base=2.0 * np.eye(4)), ("base", "rotation")),
@@ -232,12 +236,13 @@ OF_NOISE = [
     (noisy(vp.CustomNoise(field, 3.0)), ("CustomNoise processes", "3.0")),
     (noisy(vp.CustomNoise(None, 3)), ("CustomNoise field", "None")),
     (noisy(vp.CustomNoise(field, 3, dv=0.0)), "CustomNoise dv"),
+    (lambda: vp.simulate(NOISY, REST, REST, dt=1e-3, steps=9, increments=1.0), ("increments", "(9, 2)")),
     (lambda: wiener.coarsen(np.zeros((9, 1)), 2), ("number", "9", "2")),
     (lambda: wiener.coarsen(np.zeros(8)), ("increments", "(8,)")),
     (lambda: wiener.wiener_increments(2, 0.1, 3, increments=np.zeros((3, 1))), ("(3, 2)", "(3, 1)")),
     (lambda: wiener.wiener_increments(1, 0.1, 1, 0, np.zeros((1, 1))), ("rng", "increments")),
 ]
-SCENE = vp.Scene(TWO)
+SCENE, NOISY = vp.Scene(TWO), vp.Scene(TWO, noise=vp.AdditiveNoise(0.1))
 MOTION = vp.simulate(SCENE, REST, REST, dt=1e-3, steps=2)
 OTHER_Z = np.array([[0.0] * 4, [0.0, 0.0, np.nan, 0.0]])
 
@@ -246,7 +251,17 @@ def moved(**controls):
     return lambda: vp.simulate(SCENE, REST, REST, dt=1e-3, steps=5, **controls)
 
 
+def looped(name="four-bar", **options):
+    case = ZOO[name]
+    return lambda: vp.simulate(case.scene, case.q0, case.v0, dt=1e-2, steps=2, **options)
+
+
+LOOP = ZOO["four-bar"]
+FREE_ALONE = vp.Radau(2), vp.Midpoint(0.4), vp.RungeKutta4(), vp.SemiImplicitEuler(), vp.ExplicitEuler(), vp.Reference()
 OF_MOTIONS = [
+    *((looped(integrator=own), (type(own).__name__, "constraints", "Gauss")) for own in FREE_ALONE),
+    (looped("trembling loop", rng=0, integrator=vp.Midpoint(kick="split")), ("kick", "'split'", "constraints")),
+    (lambda: vp.discrete_lagrangian(LOOP.scene, LOOP.q0, LOOP.q0, 1e-2), "constraints"),
     *(
         (lambda kind=kind, own=own: kind(**own), facts)
         for kind in (vp.Gauss, vp.Radau)
@@ -270,6 +285,8 @@ OF_MOTIONS = [
         for x in (None, np.zeros((3, 1)))
         for call in (vp.linearize, lambda scene, motion: vp.second_order(scene, motion, np.zeros(4)))
     ),
+    (lambda: vp.simulate(NOISY, REST, REST, duration=1.0, tolerance=1e-3), "noise"),
+    (lambda: vp.simulate(NOISY, REST, REST, dt=1e-3, steps=1, rng=0, integrator=vp.Reference()), "noise"),
     (lambda: vp.OpenLoop(lambda t, q, v: [0.0, 0.0]), ("(t, q, v)", "controls=law")),
     (lambda: vp.OpenLoop(lambda: [0.0, 0.0]), ("OpenLoop", "time")),
     (lambda: vp.OpenLoop([0.0, 0.0]), ("OpenLoop", "[0.0, 0.0]")),
@@ -281,6 +298,21 @@ OF_MOTIONS = [
         for call in (MOTION.save, vp.Trajectory.load)
     ),
 ]
+# Names that a robot has not, with the nearest one that it has.
+UR5, PANDA = vp.load_robot("ur5"), vp.load_robot("panda")
+OF_NAMES = [
+    (ur5(lock={"elbow_joit": 0.0}), ("'ur5'", "'elbow_joit'", "'elbow_joint'")),
+    (ur5(lock={3: 0.0}), ("'3'", "'wrist_3_joint'")),
+    (ur5(keep=["elbow"]), ("keep", "'elbow'", "'elbow_joint'")),
+    *(
+        (lambda x=x: vp.Scene(TWO, actuation=x), ("'chain2'", "'jont2'", "'joint2'"))
+        for x in ("jont2", ["joint1", "jont2"])
+    ),
+    (lambda: vp.KeepInBox(TWO, "hand", 0, 1), ("'chain2'", "'hand'")),
+    (lambda: PANDA.frame_positions(np.zeros(8), "hand"), ("'panda'", "'hand'", "'panda_hand'")),
+    (lambda: vp.FramePositionCost(UR5, "tool", [0, 0, 0]), ("'ur5'", "'tool'", "'tool0'")),
+    (lambda: vp.FramePositionCost(UR5, [0, 0, 0], "tip"), ("'ur5'", "'[0, 0, 0]'")),
+]
 TABLES = [OF_PROBLEMS, OF_COSTS, OF_CONSTRAINTS, OF_SEARCHES, OF_CONTROLLERS, OF_TIMES, OF_ROBOTS, OF_NOISE, OF_MOTIONS]
 
 
@@ -288,3 +320,11 @@ TABLES = [OF_PROBLEMS, OF_COSTS, OF_CONSTRAINTS, OF_SEARCHES, OF_CONTROLLERS, OF
 def test_it_is_refused(make, facts):
     with refused(vp.InputError, facts):
         make()
+
+
+@pytest.mark.parametrize(("make", "facts"), OF_NAMES)
+def test_names_that_are_not_there(make, facts):
+    with pytest.raises((vp.UnknownJoint, vp.UnknownFrame)) as info:
+        make()
+    assert not unnamed(str(info.value), facts)
+    assert {f"'{name}'" for name in info.value.matches[:1]} <= {*facts}

@@ -8,6 +8,7 @@ import pinocchio as pin
 import pytest
 from chromium import animation, commands, names, picture, pose, poses, seek, shape_poses, shapes_stand
 from oracles import placements
+from plan_problems import CAPSULES
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
@@ -295,9 +296,6 @@ def test_refuses_marks_it_cannot_show(ur5, sweep, run, crank, tmp_path):
     moved = vp.simulate(by_hand, [0.3, 0.3], [0, 0], dt=0.02, steps=3)
     no("torques=True", robot=by_hand.robot, motion=moved, dt=None, torques=True)
     assert not page.exists()
-
-
-CAPSULES = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05), "joint2": ([0, 0, 0], [1, 0, 0], 0.05)}
 
 
 @pytest.fixture(scope="module")

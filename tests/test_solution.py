@@ -3,33 +3,33 @@
 import dataclasses
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from findings import about
-from oracles import slope
-from plan_problems import SMALL, TWO, UR5, arm, linear, reach
+from oracles import Mechanism, exact, slope
+from plan_problems import SMALL, UR5, arm, linear, reach
 from refusals import naming, refused, unnamed
-from scipy.integrate import solve_ivp
 
 import varpin as vp
 from varpin.control.refine import refine
 
 
-def on_robot(plan, law=None, method="DOP853", rtol=1e-11):
-    """Cost and end of a plan of ``reach`` on the continuous robot: SciPy on Pinocchio's aba, the cost beside it."""
-    problem, scene, model = plan.problem, plan.problem.scene, plan.problem.scene.robot.model
-    data, x, dt = model.createData(), np.concatenate([problem.q0, problem.v0, [0.0]]), problem.dt * problem.hold
-    for k, row in enumerate(plan.controls):
-        u = row if law is None else law(k, x[:2], x[2:4], row)
+def on_robot(plan, law=None):
+    """Cost and end of a plan of ``reach`` on the continuous robot.
 
-        def rate(t, x, u=u):
-            q, v = x[:2], x[2:4]
-            a = pin.aba(model, data, q, v, scene.actuation @ u - scene.damping * v)
-            return np.concatenate([v, a, [1e-2 * (u @ u + v @ v)]])
+    Its dampers of 0.1 N m s tell the integral of v^2: of what the drives give they take what is not work in all.
+    """
+    problem, u = plan.problem, []
 
-        x = solve_ivp(rate, (k * dt, (k + 1) * dt), x, method=method, rtol=rtol, atol=1e-2 * rtol).y[:, -1]
-    q, v = x[:2], x[2:4]
-    return x[4] + 100.0 * ((q - [1.0, 0.5]) ** 2).sum() + 10.0 * v @ v, q
+    def signal(k, q, v):
+        u.append(plan.controls[k] if law is None else law(k, q, v, plan.controls[k]))
+        return lambda t: u[k]
+
+    times = problem.dt * problem.hold * np.arange(len(plan.controls) + 1)
+    own = exact(problem.scene, problem.q0, problem.v0, times, signal)
+    lost = np.sum(u * np.diff(own.q, axis=0)) - own.work[-1]
+    q, v = own.q[-1], own.v[-1]
+    running = 1e-2 * (times[1] * np.sum(np.square(u)) + lost / 0.1)
+    return running + 100.0 * ((q - [1.0, 0.5]) ** 2).sum() + 10.0 * v @ v, q
 
 
 @pytest.mark.parametrize(
@@ -99,31 +99,16 @@ def test_motion_that_runs_away():
     assert fine.accuracy <= 1e-6
 
 
-def test_dampers_far_faster_than_the_step_are_followed():
-    sol = vp.solve(reach(scene=vp.Scene(TWO, damping=[0.1, 100.0]), integrator=vp.Gauss(4)))
-    found = sol.verify(tolerance=1e-7)
-    assert found.integrator == "Radau(stages=3)"
-    cost, end = on_robot(sol, method="Radau", rtol=1e-9)
-    assert found.open_loop_cost == pytest.approx(cost, rel=1e-6)
-    assert found.open_loop_gap == pytest.approx(np.abs(end - sol.trajectory.q[-1]).max(), rel=1e-4)
-
-
 def test_policy_on_velocities_and_back():
     plan = vp.solve(arm(*UR5, lambda *_: [], hold=5, integrator=vp.Midpoint()), check=False)
-    model, data, n = plan.problem.scene.robot.model, plan.problem.scene.robot.model.createData(), 6
-
-    def momentum(q, v):
-        M = pin.crba(model, data, q)
-        return (np.triu(M) + np.triu(M, 1).T) @ v
-
+    own, n = Mechanism(plan.problem.scene), 6
     policy = plan.policy_on("velocity")
     assert policy.hold_at(plan.problem.dt / 5) == 25
     for r in (0, 2, 5):
         q, v = plan.trajectory.q[5 * r], plan.trajectory.v[5 * r]
         np.testing.assert_array_equal(policy.reference[r], np.concatenate([q, v]))
-        columns = np.array([slope(lambda x, v=v: momentum(x, v), q, e, 0.02) for e in np.eye(n)])
-        M = np.array([momentum(q, e) for e in np.eye(n)]).T
-        turned = plan.gains[r] @ np.block([[np.eye(n), np.zeros((n, n))], [columns.T, M]])
+        columns = np.array([slope(lambda x, v=v: own.mass_matrix(x) @ v, q, e, 0.02) for e in np.eye(n)])
+        turned = plan.gains[r] @ np.block([[np.eye(n), np.zeros((n, n))], [columns.T, own.mass_matrix(q)]])
         np.testing.assert_allclose(policy.gains[r], turned, rtol=0, atol=1e-8 * np.abs(turned).max())
     other = plan.problem.at(integrator=vp.RungeKutta4())
     turned = dataclasses.replace(plan, problem=other, gains=plan.policy_on("velocity").gains.copy())
@@ -184,12 +169,9 @@ def test_paths_that_fail_are_counted():
     robot, start = vp.load_robot("finger"), np.array([0.2, 0.3, 0.2])
     goal = vp.TrackingCost([0.8, 0.5, 0.4], 10.0)
     cost = goal + vp.ControlCost(1e7) + vp.Terminal(goal + vp.VelocityCost(0.1))
-    quiet, noisy = (
-        vp.OptimalControlProblem(
-            vp.Scene(robot, damping=1e-6, noise=noise), cost, start, np.zeros(3), dt=5e-3, steps=100
-        )
-        for noise in (None, vp.ControlNoise(0.3))
-    )
+    scenes = (vp.Scene(robot, damping=1e-6, noise=noise) for noise in (None, vp.ControlNoise(0.3)))
+    given = {"dt": 5e-3, "steps": 100}
+    quiet, noisy = (vp.OptimalControlProblem(scene, cost, start, np.zeros(3), **given) for scene in scenes)
     found = dataclasses.replace(vp.solve(quiet), problem=noisy).monte_carlo(16, 1)
     assert found.failures > 0
     assert found.paths + found.failures == 16
@@ -310,12 +292,6 @@ def test_an_interrupt_keeps_the_best(after):
         assert plan.problem.dt == pytest.approx(best.dt)
     else:
         assert plan.problem.dt == pytest.approx(0.25)
-
-
-def test_saved_with_the_plan(tmp_path):
-    plan = vp.solve(reach_to_cost(4), true_cost=1e-4, check=False)
-    again = vp.Solution.load(plan.save(tmp_path / "plan.npz"), plan.problem)
-    assert again.refinement == plan.refinement
 
 
 def test_no_plan_within_constraints():

@@ -1,7 +1,5 @@
 """What is said of joint values: limits that are passed, degrees and millimetres, each in the units of its joints."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -221,6 +219,7 @@ def test_references_along_a_plan_are_looked_at_too(scene):
             ("payload", "'tool0'"),
         ),
         (lambda k: vp.load_robot("ur5", payload=vp.Payload("tool0", k * 2.0)), ("2000 kg", "grams")),
+        (lambda k: vp.Scene(vp.planar_chain(1), gravity=[0.0, 0.0, k * -24.8]), ("gravity", "-24800.0", "mm/s^2")),
         (lambda k: vp.planar_chain(2, length=k * 0.5), ("'joint1' and 'joint2'", "500 m", "millimetres")),
     ],
 )

@@ -6,8 +6,6 @@
 Scenes are built with their first use, once. Groups of names, such as ``LOOPS``, are for parametrization.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
