@@ -102,7 +102,7 @@ def period_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     """
     if not trajectory.steps or scene.noise.diffusion is None or not np.abs(trajectory.v).max() > 0.0:
         return math.nan
-    units = travel_scales(scene, trajectory.q), speed_scales(scene, trajectory.v)
+    units = travel_scales(scene, trajectory.q)[-1], speed_scales(scene, trajectory.v)
     worst, end = math.nan, time.process_time() + _PATIENCE_PERIODS
     for step in np.unique(np.linspace(0, max(0, trajectory.steps - _STEPS), _BEGINS).astype(np.int64)).tolist():
         worst = np.fmax(worst, _error_from(scene, integrator, trajectory, step, units))

@@ -235,7 +235,7 @@ def test_a_coarse_step_is_told_of(caplog):
     scene = fragile_scene(2)
     with caplog.at_level(logging.WARNING, "varpin.ensemble"):
         end, again = run(scene, **COARSE), run(scene, **COARSE)
-    assert naming(about(end.warnings, "error"), "joint2", "varpin.Gauss(3)")
+    assert naming(about(end.warnings, "error"), "joint2", "varpin.Gauss(6)")
     assert all(warning.startswith("path ") for warning in end.warnings)
     assert again.warnings == end.warnings
     # Once in the log, and in every form of the result.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from varpin.mechanics.scene import Scene
 from varpin.model import joint_unit
 from varpin.signals.commands import changing, cubics, in_parts, in_parts_of_steps, open_loop, prescribing, rows, shares
 from varpin.signals.controls import Controls, commands_of
-from varpin.signals.functions import ControlLaw, Sampled, decision, left_by_stages
+from varpin.signals.functions import ControlLaw, Copies, Sampled, decision, left_by_stages
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.gate import proven_error
 from varpin.simulation.limits import beyond_limits
@@ -39,6 +40,11 @@ from varpin.trajectory import Trajectory
 # joint's largest speed. Motions off by 5 % are wrong and those off by 0.3 % are right for any use: between 0.5 and 4 %
 # the same of 400 random motions are told of.
 TOLD, TOLD_VELOCITY = 0.01, 0.25
+# Shares of the travel up to which errors grow as small ones do, and tell what reduces them; from 0.05 to 0.3.
+_LINEAR = 0.1
+# Growth of deviations from which on a motion is told to be sensitive; from 3e3 to 2e4: swings of chains reach 2e3 in a
+# hundred seconds, falls of arms 1e5 in two.
+_SENSITIVE = 1e4
 # The share that a better step should leave.
 _AIM = 0.2
 # Most parts of a step that are named; the order of motions with kinks in forces.
@@ -48,8 +54,6 @@ _MOST_PARTS, _KINKED = 10, 2
 _RESOLVED = 0.02
 # The rate of dampers and stops that a step resolves, in units of 1 / dt: with 1 to 3 the same advice is right.
 _RINGS = 2.0
-# Stages of the repetition beyond those of a motion of the same order.
-_MORE = 2
 # Points of a step at which a custom force is looked at: none are more than 8 % of the step's travel apart.
 _POINTS = 20
 # Steps of one joint between two checks for Ctrl-C: a tenth of a second.
@@ -66,7 +70,7 @@ def check(
     restart: int = 0,
     known: Floats | None = None,
     hold: int = 0,
-    law: ControlLaw | None = None,
+    law: Copies | None = None,
 ) -> Trajectory:
     """The motion with its error and its warnings, the worst first.
 
@@ -78,7 +82,7 @@ def check(
         restart: Steps after which a controller corrects errors: the repetition begins anew there; 0 for none.
         known: The error, if it is known (N + 1, n): nothing is repeated.
         hold: The period of a control law in steps, 0 for none.
-        law: A copy of the law as it was before the motion; None if it cannot be copied.
+        law: What makes copies of the law as it was before the motion; None if it cannot be copied.
     """
     function = controls if isinstance(controls, Sampled) else None
     extremes = None if function is None else function.whole.extremes
@@ -100,16 +104,22 @@ def check(
     alone = resolved and not (held_mean or calls or hold)
     proven = proven_error(scene, integrator, trajectory) if alone else None
 
-    def repeat() -> tuple[Floats, Floats, float]:
-        return repeated(scene, integrator, trajectory, controls, restart, law, hold)
+    def repeat(shift: float = 0.0) -> tuple[Floats, Floats, float]:
+        return repeated(scene, integrator, trajectory, controls, restart, law and law(), hold, shift)
 
     found: tuple[Finding, ...] = ()
     if proven is not None:
         motion = trajectory.with_error(lambda: distance(repeat(), trajectory)[0], proven)
     else:
         try:
-            off, speed_off = distance(repeat(), trajectory)
-            found = error_findings(scene, integrator, trajectory, off, speed_off, controls, hold)
+            again = repeat()
+            off, speed_off = distance(again, trajectory)
+
+            def rounded() -> Floats:
+                last_digit = float(np.spacing(max(1.0, np.abs(trajectory.q[0]).max())))
+                return np.abs(repeat(math.sqrt(trajectory.steps) * last_digit)[0] - again[0])
+
+            found = error_findings(scene, integrator, trajectory, off, speed_off, rounded, controls, hold)
             found = found or short_forces(scene, integrator, trajectory)
         except (CustomForceError, CustomConstraintError) as error:
             off = np.full_like(trajectory.q, np.nan)
@@ -117,6 +127,11 @@ def check(
             found = (Finding("error", text),)
         motion = trajectory.with_error(off)
     return motion.changed(warnings=(*found, *limits))
+
+
+def more_stages(integrator: Integrator) -> int:
+    """Two stages more than a collocation of the order of a method has."""
+    return (integrator.order + 1) // 2 + 2
 
 
 def distance(again: tuple[Floats, Floats, float], trajectory: Trajectory) -> tuple[Floats, Floats]:
@@ -148,7 +163,7 @@ def closer(
     own = isinstance(integrator, RungeKutta4)
     if (own and not sampled) or (fed and not integrator.variational):
         return RungeKutta4(), 2 * parts, (2.0 * parts) ** -integrator.order if own else 0.0
-    stages = (integrator.order + 1) // 2 + _MORE
+    stages = more_stages(integrator)
     if stages > MOST_STAGES:
         stages, parts = MOST_STAGES, 2 * parts
     kick = integrator.kick
@@ -163,15 +178,17 @@ def repeated(
     restart: int = 0,
     law: ControlLaw | None = None,
     hold: int = 0,
+    shift: float = 0.0,
 ) -> tuple[Floats, Floats, float]:
     """A motion repeated by the method of :func:`closer`: q and v (N + 1, n), NaN where it failed; and its share.
 
-    The arguments are those of :func:`check`. A ``law`` replaces the controls, every ``hold`` steps.
+    The arguments are those of :func:`check`. A ``law`` replaces the controls, every ``hold`` steps. The start is off by
+    ``shift`` [rad or m].
     """
     fed = isinstance(controls, LinearPolicy) or (isinstance(controls, Commands) and len(controls.gains) > 0)
     method, parts, left = closer(scene, integrator, trajectory, fed=fed, sampled=isinstance(controls, OpenLoop))
     q, v = np.full((2, *trajectory.q.shape), np.nan)
-    q[0], v[0] = trajectory.q[0], trajectory.v[0]
+    q[0], v[0] = trajectory.q[0] + shift, trajectory.v[0]
     commands = _commands(scene, integrator, method, trajectory, controls, parts)
     drawn, kicks = _noise(scene, integrator, method, trajectory, parts)
     drift = None
@@ -228,18 +245,16 @@ def _commands(
     dt, times = trajectory.dt / parts, method.stage_times
     if trajectory.u_nodes.shape[1]:
         controls = FirstOrderHold(trajectory.u_nodes)
-    if isinstance(controls, FirstOrderHold) and not scene.inputs:
-        return commands_of(scene, method, controls.refined(parts), trajectory.steps * parts, dt)
-    held = open_loop(in_parts_of_steps(scene, trajectory.u, trajectory.q[:-1], trajectory.v[:-1], trajectory.dt, parts))
-    if isinstance(controls, OpenLoop):
+    if isinstance(controls, FirstOrderHold):
+        controls = None if scene.inputs else controls.refined(parts)
+    if isinstance(controls, FirstOrderHold | OpenLoop):
         return commands_of(scene, method, controls, trajectory.steps * parts, dt)
-    if isinstance(controls, LinearPolicy | Commands) and method.variational == integrator.variational:
-        fed = (
-            controls
-            if isinstance(controls, Commands)
-            else commands_of(scene, method, controls, trajectory.steps, trajectory.dt)
-        )
-        return fed._replace(hold=fed.hold * parts)
+    alike = method.variational == integrator.variational
+    if isinstance(controls, LinearPolicy) and alike:
+        controls = commands_of(scene, method, controls, trajectory.steps, trajectory.dt)
+    if isinstance(controls, Commands) and alike:
+        return controls._replace(hold=controls.hold * parts)
+    held = open_loop(in_parts_of_steps(scene, trajectory.u, trajectory.q[:-1], trajectory.v[:-1], trajectory.dt, parts))
     if not trajectory.u_stages.shape[1]:
         return held
     within = in_parts(trajectory.u_stages, integrator.stage_times, parts, times)
@@ -287,43 +302,56 @@ def error_findings(
     trajectory: Trajectory,
     off: Floats,
     speed_off: Floats,
+    rounded: Callable[[], Floats],
     controls: Controls | Commands = None,
     hold: int = 0,
 ) -> tuple[Finding, ...]:
-    """The warning of a motion's error, if it is large, from errors of q and v at its nodes (N + 1, n)."""
+    """The warning of a motion's error, if it is large, from errors of q and v at its nodes (N + 1, n).
+
+    Its time is the last one until which the motion, ended there, would have no warning of q. ``rounded`` finds how far
+    the rounding of all steps takes q at the nodes apart (N + 1, n).
+    """
     cure = functools.partial(_cure, scene, integrator, trajectory, controls, hold)
-    known = np.asarray(np.isfinite(off).all(axis=1))
-    last = int(known.argmin()) if not known.all() else len(known)
+    last = int(np.append(np.isfinite(off).all(axis=1), False).argmin())
     names, t = trajectory.joint_names, trajectory.t
     q, v = trajectory.q[:last], trajectory.v[:last]
     travel, speed = travel_scales(scene, q), speed_scales(scene, v)
-    shares = off[:last] / travel
-    joint = int(shares.max(axis=0).argmax())
-    share = float(shares[:, joint].max())
+    shares = np.maximum.accumulate(off[:last]) / travel
+    joint = int(shares[-1].argmax())
+    share = float(shares[-1, joint])
     if share > TOLD:
-        worst, first = int(shares[:, joint].argmax()), int((shares > TOLD).any(axis=1).argmax())
+        right = int(np.flatnonzero((shares <= TOLD).all(axis=1))[-1])
         unit = joint_unit(scene.robot, joint)
-        value = float(off[worst, joint])
+        value = float(off[:last, joint].max())
         part = f", {100.0 * share:.2g} % of the largest travel" if share < 1.0 else ""
-        since = f"right until t = {t[first - 1]:.3g} s" if first > 1 else "from the start"
-        where = f"(joint {names[joint]!r}, {since})"
-        text = f"q is off by up to {value:.2g} {unit}{part} {where}. "
-        return (
-            Finding("error", text + cure(share / TOLD), names[joint], time=float(t[first - 1]), value=value, unit=unit),
+        text = (
+            f"q is off by up to {value:.2g} {unit}{part} (joint {names[joint]!r}, wrong from t = {t[right]:.3g} s on). "
         )
+        if share <= _LINEAR:
+            advice = cure(share / TOLD)
+        else:
+            apart = np.maximum.accumulate(rounded()[:last])
+            growth, drift = float(apart[-1].max() / apart[right].max()), (apart / travel).max(axis=1)
+            advice = cure(max(share / TOLD, growth))
+            if drift[-1] > TOLD:
+                shorter = f"a shorter duration, as even rounding errors grow to {apart[-1, joint]:.2g} {unit}"
+                advice = f"Use {shorter}" if drift[right + 1] > TOLD else f"{advice}, or {shorter}"
+            elif growth > _SENSITIVE:
+                advice += f", as deviations grow more than {_SENSITIVE:g}-fold"
+        return (Finding("error", text + advice, names[joint], time=float(t[right]), value=value, unit=unit),)
     # A jump that comes a part of a step too late is no error of the motion.
     lasting = np.minimum(speed_off[: last - 1], speed_off[1:last]) / speed
     if len(lasting) and lasting.max() > TOLD_VELOCITY:
         first, joint = divmod(int(lasting.argmax()), lasting.shape[1])
+        share = float(lasting[first, joint])
         unit = joint_unit(scene.robot, joint, speed=True)
         value = float(speed_off[first, joint])
         text = (
-            f"the velocity of joint {names[joint]!r} is off by up to {value:.2g} {unit}, {100.0 * lasting.max():.2g} % "
-            f"of its largest (t = {t[first]:.3g} s). "
+            f"the velocity of joint {names[joint]!r} is off by up to {value:.2g} {unit}, {100.0 * share:.2g} % of its "
+            f"largest (t = {t[first]:.3g} s). {cure(share / TOLD_VELOCITY)}"
         )
-        text += cure(float(lasting.max()) / TOLD_VELOCITY)
         return (Finding("error", text, names[joint], time=float(t[first]), value=value, unit=unit),)
-    if last < len(known):
+    if last < len(off):
         text = (
             f"the error is not known from t = {t[last]:.3g} s on: a method of more stages fails there. Use a smaller dt"
         )
@@ -348,12 +376,21 @@ def _cure(
         return "Damping or friction is faster than the step: use integrator=varpin.Radau(4)"
     if isinstance(integrator, Reference):
         return "Use a smaller rtol"
-    stages = (integrator.order + 1) // 2 + _MORE
+    stages = more_stages(integrator)
     if isinstance(controls, Sampled) and left_by_stages(controls, stages) > _RESOLVED:
         return "The controls change faster than the step. Use a smaller dt"
     # Kinks of forces cost any method its order.
     order = integrator.order if scene.smooth else min(integrator.order, _KINKED)
-    times = (max(excess, 1.0) / _AIM) ** (1.0 / order)
+    need = max(excess, 1.0) / _AIM
+    times = need ** (1.0 / order)
+    kept = isinstance(controls, LinearPolicy) and not integrator.variational
+    kept |= trajectory.noisy and integrator.l_stable
+    kept |= stages > MOST_STAGES or not (scene.smooth or not scene.elements)
+    either = kept or times < _MOST_PARTS
+    if not either:
+        # Of a low order smaller steps take too many. The fewest stages to which half of the step is enough:
+        stages = min(max(stages, math.ceil(0.5 * math.log2(need))), MOST_STAGES)
+        times = need ** (0.5 / stages)
     parts = max(2.0, min(times, _MOST_PARTS), contact / most)
     parts, smaller = finer(trajectory, math.ceil(parts))
     if hold:
@@ -362,13 +399,12 @@ def _cure(
         smaller += f" with hold={controls.hold * parts} in the policy"
     if contact > most:
         return f"Stops are stiffer than the step resolves. Use {smaller}"
-    kept = isinstance(controls, LinearPolicy) and not integrator.variational
-    kept |= trajectory.noisy and integrator.l_stable
-    if kept or stages > MOST_STAGES or not (scene.smooth or not scene.elements):
+    if kept:
         return f"Use {smaller}"
     other = f"integrator=varpin.{'Radau' if integrator.l_stable else 'Gauss'}({stages})"
-    # Of a low order smaller steps take too many, and errors as large as the motion tell no more how many.
-    return f"Use {other} or {smaller}" if times < _MOST_PARTS else f"Use {other}"
+    if either:
+        return f"Use {other} or {smaller}"
+    return f"Use {other} and {smaller}" if times > 2.0 else f"Use {other}"
 
 
 def short_forces(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
@@ -387,7 +423,7 @@ def short_forces(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
         found = np.array([force(*state, False)[0] for state in zip(at, rate, strict=True)])
         missed[k] = dt * (0.5 * weights @ found[len(times) :] - shares(times) @ found[: len(times)])
     speeds = np.abs(np.linalg.solve(scene.core.jets(q[:-1], v[:-1])[0], missed[:, :, None])[:, :, 0])
-    off = speeds * (trajectory.t[-1] - trajectory.t[:-1, None]) / travel_scales(scene, q)
+    off = speeds * (trajectory.t[-1] - trajectory.t[:-1, None]) / travel_scales(scene, q)[-1]
     step, joint = divmod(int(off.argmax()), off.shape[1])
     if not off[step, joint] > TOLD:
         return ()

@@ -57,7 +57,7 @@ def proven_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
         trajectory.dt,
         narrow=narrow,
         wide=wide,
-        most_q=_TRAVEL * travel_scales(scene, trajectory.q),
+        most_q=_TRAVEL * travel_scales(scene, trajectory.q)[-1],
         most_v=_SPEED * speed_scales(scene, trajectory.v),
     )
     damped = bool(scene.elements)

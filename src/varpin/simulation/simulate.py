@@ -197,9 +197,7 @@ def simulate(
         if check:
             ended = interrupted and not isinstance(controls, Sampled)
             more = None if callable(controls) or ended else controls
-            motion = checked(
-                scene, integrator, motion, more, known=known, hold=period if law else 0, law=kept and kept()
-            )
+            motion = checked(scene, integrator, motion, more, known=known, hold=period if law else 0, law=kept)
             unstable = () if loop is None else loop(motion)
             wrong = [finding for finding in motion.warnings if finding.kind == "error"]
             unsettled = function_findings(controls) if isinstance(controls, Sampled) else ()

@@ -178,18 +178,18 @@ def largest_of_its_kind(scene: Scene, values: Floats) -> Floats:
 
 
 def travel_scales(scene: Scene, q: Floats) -> Floats:
-    """For each coordinate (n,), the travel of which errors are shares, from the nodes q (K, n).
+    """For each node of q (K, n) and coordinate, the travel up to it of which errors are shares.
 
     It is the largest travel of the coordinate's kind; where joints turn and slide, at least ``_LITTLE`` of what the
     others move at the robot's reach.
     """
-    travel = largest_of_its_kind(scene, q.max(axis=0) - q.min(axis=0))
+    travel = largest_of_its_kind(scene, np.maximum.accumulate(q) - np.minimum.accumulate(q))
     sliding = scene.robot.slides
     if sliding.any() and not sliding.all():
         reach = longest_reach(scene.robot)
         # On rails without ends: a metre.
         lever = reach if 0.0 < reach < np.inf else 1.0
-        turns, slides = float(travel[~sliding].max()), float(travel[sliding].max())
+        turns, slides = (travel[:, kind].max(axis=1, keepdims=True) for kind in (~sliding, sliding))
         travel = np.maximum(travel, _LITTLE * np.where(sliding, turns * lever, slides / lever))
     scales: Floats = np.maximum(travel, max(_SHORTEST, _ROUNDING * (1.0 + float(np.abs(q).max(initial=0.0)))))
     return scales
