@@ -30,6 +30,7 @@ from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import generator
 from varpin.signals.commands import in_parts_of_steps, with_ends
+from varpin.signals.policy import LinearPolicy
 from varpin.simulation.check import check
 from varpin.simulation.choice import given_integrator, usual_integrator
 from varpin.simulation.failures import Interrupted, StepFailure
@@ -311,7 +312,7 @@ class Mpc:
         constraints, violated = loop.constraints(motion)
         found = (
             *noise_forgotten(scene, rng),
-            *unstable_loop(scene, motion, plant.substeps, loop.gains()),
+            *loop.unstable(motion),
             *motion.warnings,
             *loop.without_plans(),
             *violated,
@@ -411,14 +412,17 @@ class _Loop:
 
     def told(self, motion: Trajectory) -> Trajectory:
         """The plant's motion up to where it ended early, with its warnings and those of ticks without a plan."""
-        return motion.changed(warnings=(*beyond_limits(self.plant.scene, motion), *self.without_plans()))
+        limits = beyond_limits(self.plant.scene, motion)
+        return motion.changed(warnings=(*self.unstable(motion), *limits, *self.without_plans()))
 
-    def gains(self) -> Gains | None:
-        """The feedback of each tick; None for controls that are linear between nodes."""
-        if self.problem.linear:
-            return None
-        rows = (tick.plan.policy.feedback[min(tick.age, _lines(tick.plan) - 1)] for tick in self.ticks)
-        return Gains(np.array(list(rows)), self.problem.integrator.variational)
+    def unstable(self, motion: Trajectory) -> tuple[Finding, ...]:
+        """The warning of a loop that is unstable at its period, under the feedback of each tick if it is held."""
+        gains = None
+        if not self.problem.linear:
+            acting = (_acting(tick.plan, tick.age) for tick in self.ticks)
+            rows = zip(*((policy.feedback[row], policy.reference[row]) for policy, row in acting), strict=True)
+            gains = Gains(*map(np.array, rows), momentum=False)
+        return unstable_loop(self.plant.scene, motion, self.plant.substeps, gains)
 
     def without_plans(self) -> Iterator[Finding]:
         """Warnings if more than a few plans took longer than the budget or the period, or searches found no plan."""
@@ -500,15 +504,20 @@ def _lines(plan: Solution) -> int:
     return plan.problem.decisions - plan.problem.linear
 
 
+def _acting(plan: Solution, age: int) -> tuple[LinearPolicy, int]:
+    """The feedback on (q, v) of the plan's decision ``age``, beyond its end that of the last one, and its row."""
+    if age < _lines(plan):
+        return plan.policy_on("velocity"), age
+    return plan.shifted(plan.problem.decisions - 1, x="velocity"), 0
+
+
 def _decision(plan: Solution, age: int, x: Floats, before: Floats | None) -> Floats:
     """Control (m,) of the plan's decision ``age`` with feedback at the state x = (q, v), after the control ``before``.
 
     Where controls are linear between nodes it is the control at the end of the tick, and ``before`` that at its begin.
     """
-    if age < _lines(plan):
-        u = plan.policy_on("velocity").control(age, x, before)
-    else:
-        u = plan.shifted(plan.problem.decisions - 1, x="velocity").control(0, x, before)
+    policy, row = _acting(plan, age)
+    u = policy.control(row, x, before)
     for bound in plan.problem.bound_constraints:
         if isinstance(bound, BoundRate) and before is not None:
             most = bound.limit * bound.period
