@@ -29,8 +29,7 @@ from varpin.integrators import Integrator
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import generator
-from varpin.signals.commands import in_parts_of_steps, with_ends
-from varpin.signals.policy import LinearPolicy
+from varpin.signals.commands import in_parts_of_steps, on_lines, with_ends
 from varpin.simulation.check import check
 from varpin.simulation.choice import given_integrator, usual_integrator
 from varpin.simulation.failures import Interrupted, StepFailure
@@ -358,6 +357,8 @@ class _Loop:
         if plan.status is Status.INTERRUPTED or any(told.kind == "interrupted" for told in plan.warnings):
             raise KeyboardInterrupt
         self.applied = self.problem.before
+        self.feedback: list[Floats] = []  # gains of each tick on (q, v), and what they follow
+        self.reference: list[Floats] = []
         self.nodes: list[tuple[float, Floats, Floats]] = []  # of the tick so far
         self.rows = np.zeros((0, plant.scene.controls))  # controls of its steps
 
@@ -398,17 +399,29 @@ class _Loop:
         self.ticks.append(_Tick(plan, age, seconds, iterations, late, "" if late else failure))
 
     def decide(self, q: Floats, v: Floats) -> None:
-        """Make the controls of a tick: the decision of the plan that acts, or the line to it, at means of the steps."""
+        """Make the controls of a tick: the decision of the plan that acts, or the line to it, at means of the steps.
+
+        Where controls are linear between nodes it is the control at the end of the tick.
+        """
         (plan, age, *_), scene, before, substeps = self.ticks[-1], self.plant.scene, self.applied, self.plant.substeps
         if self.problem.linear and age == 0:
             # A fresh plan begins at the measured state; one that acts on, where the line before ended.
             before = plan.controls[0]
-        self.applied = _decision(plan, age, np.concatenate([q, v]), before)
+        ended = age >= _lines(plan)
+        policy = plan.shifted(plan.problem.decisions - 1, x="velocity") if ended else plan.policy_on("velocity")
+        row = 0 if ended else age
+        self.feedback.append(policy.feedback[row])
+        self.reference.append(policy.reference[row])
+        self.applied = policy.control(row, np.concatenate([q, v]), before)
+        for bound in plan.problem.bound_constraints:
+            if isinstance(bound, BoundRate) and before is not None:
+                most = bound.limit * bound.period
+                self.applied = np.clip(self.applied, before - most, before + most)
         # Joints with kinematic inputs move on one line or cubic to their next positions over the tick.
         self.rows = in_parts_of_steps(scene, self.applied[None], q[None], v[None], self.controller.period, substeps)
         if self.problem.linear and before is not None:
-            share = (np.arange(substeps)[:, None] + 0.5) / substeps
-            self.rows = with_ends(scene, before + share * (self.applied - before), self.rows)
+            begin, end = (np.tile(u, (substeps, 1)) for u in (before, self.applied))
+            self.rows = with_ends(scene, on_lines(begin, end, substeps, (0.5,))[:, 0], self.rows)
 
     def told(self, motion: Trajectory) -> Trajectory:
         """The plant's motion up to where it ended early, with its warnings and those of ticks without a plan."""
@@ -417,11 +430,8 @@ class _Loop:
 
     def unstable(self, motion: Trajectory) -> tuple[Finding, ...]:
         """The warning of a loop that is unstable at its period, under the feedback of each tick if it is held."""
-        gains = None
-        if not self.problem.linear:
-            acting = (_acting(tick.plan, tick.age) for tick in self.ticks)
-            rows = zip(*((policy.feedback[row], policy.reference[row]) for policy, row in acting), strict=True)
-            gains = Gains(*map(np.array, rows), momentum=False)
+        held = not self.problem.linear
+        gains = Gains(np.array(self.feedback), np.array(self.reference), momentum=False) if held else None
         return unstable_loop(self.plant.scene, motion, self.plant.substeps, gains)
 
     def without_plans(self) -> Iterator[Finding]:
@@ -502,27 +512,6 @@ def _require_fit(plant: Scene, planned: Scene) -> None:
 def _lines(plan: Solution) -> int:
     """How many ticks a plan lasts."""
     return plan.problem.decisions - plan.problem.linear
-
-
-def _acting(plan: Solution, age: int) -> tuple[LinearPolicy, int]:
-    """The feedback on (q, v) of the plan's decision ``age``, beyond its end that of the last one, and its row."""
-    if age < _lines(plan):
-        return plan.policy_on("velocity"), age
-    return plan.shifted(plan.problem.decisions - 1, x="velocity"), 0
-
-
-def _decision(plan: Solution, age: int, x: Floats, before: Floats | None) -> Floats:
-    """Control (m,) of the plan's decision ``age`` with feedback at the state x = (q, v), after the control ``before``.
-
-    Where controls are linear between nodes it is the control at the end of the tick, and ``before`` that at its begin.
-    """
-    policy, row = _acting(plan, age)
-    u = policy.control(row, x, before)
-    for bound in plan.problem.bound_constraints:
-        if isinstance(bound, BoundRate) and before is not None:
-            most = bound.limit * bound.period
-            u = np.clip(u, before - most, before + most)
-    return u
 
 
 def _margins(problem: OptimalControlProblem, previous: Solution, known: Multipliers) -> Multipliers:

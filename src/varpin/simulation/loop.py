@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 _NODES = 5
 # Iterations of Newton's method, and its last step [rad or m].
 _ITERATIONS, _CONVERGED = 30, 1e-8
-# Rank tolerance of the constraints in the metric of the kinetic energy, relative to the largest singular value.
+# Rank tolerance of the constraints in the metric of the kinetic energy, relative to the square of the largest.
 _RANK = 1e-9
 # Stiffness, as a share of the largest, below which a direction is free to stay anywhere.
 _SINGULAR = 1e-6
@@ -222,8 +222,8 @@ def _by_turns(scene: Scene, x: Floats, u: Floats, t: Floats, control: int, turns
 def _of_gains(scene: Scene, gains: Gains, nodes: Sequence[int]) -> Iterator[tuple[int, Loop]]:
     """The loops with linear feedback at nodes, about the states that it follows."""
     for k in nodes:
-        q, n = gains.reference[k, : scene.robot.dof], scene.robot.dof
-        K, G = np.split(gains.rows[k], [2 * n], axis=1)
+        n = scene.robot.dof
+        q, (K, G) = gains.reference[k, :n], np.split(gains.rows[k], [2 * n], axis=1)
         if gains.momentum:
             K = np.concatenate([K[:, :n], K[:, n:] @ masses(scene, q[None])[0]], axis=1)
         if K.any():
@@ -260,15 +260,17 @@ def _at_rest(scene: Scene, q: Floats, u: Floats, H: Floats, kept: Floats) -> tup
     And the way (n,) of a step of Newton's method to where there is no such force. Changes of the state are dq = Z y and
     dv = Z y'; constraint forces are constant to first order, but for their curvature lam . g_qq.
     """
-    still, force, M, Z = np.zeros((1, len(q))), (scene.actuation @ u)[None], masses(scene, q[None])[0], np.eye(len(q))
+    M, Z = masses(scene, q[None])[0], tangent_basis(scene, q)
+    still, force = np.zeros((1, len(q))), (scene.actuation @ u)[None]
     a, *_ = accelerations(scene, q[None], still, force)
     _, aq, av, af = (part[0] for part in accelerations(scene, q[None], still, force - a @ M))
     if scene.constraints:
-        Z, C = tangent_basis(scene, q), scene.core.constraints(np.ascontiguousarray(q[None]))[2][0]
+        C = scene.core.constraints(np.ascontiguousarray(q[None]))[2][0]
         lam = np.linalg.lstsq(C @ af @ C.T, -C @ a[0], rcond=_RANK)[0]
         aq = aq + af @ scene.core.constraint_curvature(q, lam, q)[0]
     onto = np.linalg.solve(Z.T @ M @ Z, Z.T @ M)
-    aq, av, pushed, H = onto @ aq @ Z, onto @ av @ Z, onto @ af @ scene.actuation, H @ np.kron(np.eye(2), Z)
+    aq, av, pushed = onto @ aq @ Z, onto @ av @ Z, onto @ af @ scene.actuation
+    H = H @ np.kron(np.eye(2), Z)
     way = Z @ np.linalg.lstsq(aq + pushed @ H.sum(axis=0)[:, : len(aq)], -onto @ a[0], rcond=_SINGULAR)[0]
     A = np.block([[np.zeros_like(aq), np.eye(len(aq))], [aq, av]])
     return Loop(A, np.concatenate([np.zeros_like(pushed), pushed]), H, kept), way
