@@ -149,12 +149,6 @@ def _inside(u: Floats) -> Integers:
     return 1 + np.flatnonzero(clipped == clipped.min())
 
 
-def _centres(x: Floats) -> Floats:
-    """Means (P - 2, 2n) of three states of x (P, 2n), where oscillations by which controls alternate are at rest."""
-    means: Floats = 0.25 * (x[:-2] + 2.0 * x[1:-1] + x[2:])
-    return means
-
-
 def _turning(u: Floats) -> tuple[int, Integers]:
     """The control of u (P, m) that turns back most within a window, and the nodes at which it does, if it is often."""
     changes = np.diff(u, axis=0)
@@ -239,8 +233,9 @@ def _of_law(
 
     Each is that of a law with the control and the responses of the node everywhere.
     """
-    middle, n = _centres(x), x.shape[1] // 2
-    centres = {k: middle[k - 1] for k in nodes}
+    n = scene.robot.dof
+    # Oscillations by which controls alternate are at rest in the mean of three states.
+    centres = {k: 0.25 * (x[k - 1] + 2.0 * x[k] + x[k + 1]) for k in nodes}
     for k, control, H in responses(scene, law, t, x, u, centres):
         q, K, kept = x[0, :n], H.sum(axis=0), np.zeros((len(control), len(control)))
         if len(H) == MEMORY:
