@@ -317,6 +317,22 @@ def test_policies():
     assert not told(motion), motion.warnings
 
 
+@pytest.mark.parametrize(("kd", "kept"), [(60.0, 0.0), (60.0, 0.4), (60.0, 0.9), (60.0, -0.3), (100.0, 0.4)])
+def test_a_policy_on_the_control_before(kd, kept):
+    """The step of (q, v, u) has its spectral radius."""
+    h, K, N = 1e-2, np.array([[-300.0, -kd]]), 60
+    A, B = np.array([[1.0, h], [0.0, 1.0]]), np.array([[0.5 * h**2], [h]]) / INERTIA
+    size = np.abs(np.linalg.eigvals(np.block([[A + B @ K, kept * B], [K, np.full((1, 1), kept)]]))).max()
+    rows, goals = np.tile(K, (N, 1, 1)), np.tile([1.0, 0.0], (N, 1))
+    policy = vp.LinearPolicy(
+        np.zeros((N, 1)), rows, goals, on="velocity", previous_gains=np.full((N, 1, 1), kept), before=[0.0]
+    )
+    found = told(run(ROD, [0.9], [0.0], policy, dt=h, steps=N, integrator=vp.RungeKutta4()))
+    assert bool(found) == (size > 1.0), (size, found)
+    for finding in found:
+        np.testing.assert_allclose(finding.value, size, rtol=1e-6)
+
+
 def test_the_sentence(caplog):
     with caplog.at_level(logging.WARNING, "varpin"):
         (sentence,) = run(ROD, [0], [0], pd(1e4, 200.0), dt=5e-3, steps=50).warnings

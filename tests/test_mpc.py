@@ -281,6 +281,42 @@ def test_errors_of_steps_do_not_add_up_in_the_loop():
     assert run.warnings == ()
 
 
+def reach(robot, q0, goal, **grid):
+    cost = vp.ControlCost(1e-2) + vp.Terminal(vp.TrackingCost(goal, 1e3) + vp.VelocityCost(10.0))
+    return vp.OptimalControlProblem(vp.Scene(robot, damping=1.0), cost, q0, np.zeros(robot.dof), **grid)
+
+
+def test_a_loop_that_keeps_what_begins_together_together_is_not_told_of():
+    """With a payload that the plans do not know: they are made anew before they get to where their gains would lead."""
+    q0 = np.array([0.35, -0.74, 0.22, -0.71, -0.39, -0.27, 0.24, -0.74])
+    problem = reach(vp.load_robot("panda"), q0, [-0.09, -0.35, 0.52, -0.78, -0.70, 0.0, 0.14, -1.0], dt=0.01, steps=30)
+    load = vp.Payload("panda_hand_tcp", 2.0, [0.05, 0.05, 0.1])
+    scene = vp.Scene(vp.load_robot("panda", payload=load), damping=1.0, noise=vp.AdditiveNoise(0.02))
+    plant, moved = vp.Plant(scene, substeps=5), 1e-7 * np.sin(np.arange(8))
+    run, other = (
+        vp.Mpc(each, iterations=1).run(plant, duration=0.4, rng=2) for each in (problem, problem.at(q0=q0 + moved))
+    )
+    assert np.abs(run.motion.q - other.motion.q).max() < 1e-6
+    assert not about(run.warnings, "unstable loop")
+
+
+@pytest.mark.parametrize(("rotors", "unstable"), [(0.05, False), (0.3, True)])
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_gains_that_are_too_high_for_the_plant_are_told_of(rotors, unstable, noise):
+    """Plans are for rotors [kg m^2] that the plant has not, and of too many all runs away."""
+    q0 = np.array([0.3, -1.2, 1.2, -0.5, -1.0, 0.2])
+    problem = reach(vp.load_robot("ur5", armature=rotors), q0, q0 + 0.1, dt=0.01, steps=20)
+    plant = vp.Scene(vp.load_robot("ur5"), damping=1.0, noise=vp.AdditiveNoise(noise))
+    run = vp.Mpc(problem, iterations=1).run(vp.Plant(plant, substeps=5), duration=0.12, rng=1)
+    assert (np.abs(run.motion.v).max() > 100.0) == unstable
+    assert bool(about(run.warnings, "unstable loop")) == unstable
+    if unstable:
+        strict = vp.Midpoint(guard=vp.Guard(max_halvings=0), kick="held")
+        with pytest.raises(vp.StepFailure) as caught:
+            vp.Mpc(problem, iterations=1).run(vp.Plant(plant, strict, substeps=5), duration=1.0, rng=1)
+        assert about(caught.value.trajectory.warnings, "unstable loop")
+
+
 # --- within constraints ----------------------------------------------------------------------------------------------
 
 

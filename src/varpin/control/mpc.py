@@ -29,7 +29,7 @@ from varpin.integrators import Integrator
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import generator
-from varpin.signals.commands import in_parts_of_steps, with_ends
+from varpin.signals.commands import in_parts_of_steps, on_lines, with_ends
 from varpin.simulation.check import check
 from varpin.simulation.choice import given_integrator, usual_integrator
 from varpin.simulation.failures import Interrupted, StepFailure
@@ -311,7 +311,7 @@ class Mpc:
         constraints, violated = loop.constraints(motion)
         found = (
             *noise_forgotten(scene, rng),
-            *unstable_loop(scene, motion, plant.substeps, loop.gains()),
+            *loop.unstable(motion),
             *motion.warnings,
             *loop.without_plans(),
             *violated,
@@ -357,6 +357,8 @@ class _Loop:
         if plan.status is Status.INTERRUPTED or any(told.kind == "interrupted" for told in plan.warnings):
             raise KeyboardInterrupt
         self.applied = self.problem.before
+        self.feedback: list[Floats] = []  # gains of each tick on (q, v), and what they follow
+        self.reference: list[Floats] = []
         self.nodes: list[tuple[float, Floats, Floats]] = []  # of the tick so far
         self.rows = np.zeros((0, plant.scene.controls))  # controls of its steps
 
@@ -397,28 +399,40 @@ class _Loop:
         self.ticks.append(_Tick(plan, age, seconds, iterations, late, "" if late else failure))
 
     def decide(self, q: Floats, v: Floats) -> None:
-        """Make the controls of a tick: the decision of the plan that acts, or the line to it, at means of the steps."""
+        """Make the controls of a tick: the decision of the plan that acts, or the line to it, at means of the steps.
+
+        Where controls are linear between nodes it is the control at the end of the tick.
+        """
         (plan, age, *_), scene, before, substeps = self.ticks[-1], self.plant.scene, self.applied, self.plant.substeps
         if self.problem.linear and age == 0:
             # A fresh plan begins at the measured state; one that acts on, where the line before ended.
             before = plan.controls[0]
-        self.applied = _decision(plan, age, np.concatenate([q, v]), before)
+        ended = age >= _lines(plan)
+        policy = plan.shifted(plan.problem.decisions - 1, x="velocity") if ended else plan.policy_on("velocity")
+        row = 0 if ended else age
+        self.feedback.append(policy.feedback[row])
+        self.reference.append(policy.reference[row])
+        self.applied = policy.control(row, np.concatenate([q, v]), before)
+        for bound in plan.problem.bound_constraints:
+            if isinstance(bound, BoundRate) and before is not None:
+                most = bound.limit * bound.period
+                self.applied = np.clip(self.applied, before - most, before + most)
         # Joints with kinematic inputs move on one line or cubic to their next positions over the tick.
         self.rows = in_parts_of_steps(scene, self.applied[None], q[None], v[None], self.controller.period, substeps)
         if self.problem.linear and before is not None:
-            share = (np.arange(substeps)[:, None] + 0.5) / substeps
-            self.rows = with_ends(scene, before + share * (self.applied - before), self.rows)
+            begin, end = (np.tile(u, (substeps, 1)) for u in (before, self.applied))
+            self.rows = with_ends(scene, on_lines(begin, end, substeps, (0.5,))[:, 0], self.rows)
 
     def told(self, motion: Trajectory) -> Trajectory:
         """The plant's motion up to where it ended early, with its warnings and those of ticks without a plan."""
-        return motion.changed(warnings=(*beyond_limits(self.plant.scene, motion), *self.without_plans()))
+        limits = beyond_limits(self.plant.scene, motion)
+        return motion.changed(warnings=(*self.unstable(motion), *limits, *self.without_plans()))
 
-    def gains(self) -> Gains | None:
-        """The feedback of each tick; None for controls that are linear between nodes."""
-        if self.problem.linear:
-            return None
-        rows = (tick.plan.policy.feedback[min(tick.age, _lines(tick.plan) - 1)] for tick in self.ticks)
-        return Gains(np.array(list(rows)), self.problem.integrator.variational)
+    def unstable(self, motion: Trajectory) -> tuple[Finding, ...]:
+        """The warning of a loop that is unstable at its period, under the feedback of each tick if it is held."""
+        held = not self.problem.linear
+        gains = Gains(np.array(self.feedback), np.array(self.reference), momentum=False) if held else None
+        return unstable_loop(self.plant.scene, motion, self.plant.substeps, gains)
 
     def without_plans(self) -> Iterator[Finding]:
         """Warnings if more than a few plans took longer than the budget or the period, or searches found no plan."""
@@ -498,22 +512,6 @@ def _require_fit(plant: Scene, planned: Scene) -> None:
 def _lines(plan: Solution) -> int:
     """How many ticks a plan lasts."""
     return plan.problem.decisions - plan.problem.linear
-
-
-def _decision(plan: Solution, age: int, x: Floats, before: Floats | None) -> Floats:
-    """Control (m,) of the plan's decision ``age`` with feedback at the state x = (q, v), after the control ``before``.
-
-    Where controls are linear between nodes it is the control at the end of the tick, and ``before`` that at its begin.
-    """
-    if age < _lines(plan):
-        u = plan.policy_on("velocity").control(age, x, before)
-    else:
-        u = plan.shifted(plan.problem.decisions - 1, x="velocity").control(0, x, before)
-    for bound in plan.problem.bound_constraints:
-        if isinstance(bound, BoundRate) and before is not None:
-            most = bound.limit * bound.period
-            u = np.clip(u, before - most, before + most)
-    return u
 
 
 def _margins(problem: OptimalControlProblem, previous: Solution, known: Multipliers) -> Multipliers:

@@ -1,9 +1,11 @@
 """The stability of a digital control loop at its period, from a finished motion and copies of its control law.
 
-At some states of the motion the law is differentiated, :mod:`varpin.signals.responses`. With the plant's exact step
-under a zero-order hold at the law's equilibrium, x' = A x + B u, the loop is unstable if the spectral radius of the
+At some states of the motion the law is differentiated, :mod:`varpin.signals.responses`, unless its gains are known.
+With the plant's exact step under a zero-order hold, x' = A x + B u, the loop is unstable if the spectral radius of the
 step of (x_k, x_(k-1), ...) exceeds one (Franklin, Powell and Workman 1998, section 4.3). Growth that the law would have
-in continuous time too, as in a falling pendulum, gives no warning.
+in continuous time too, as in a falling pendulum, gives no warning. A and B are those of the plant at rest: at the law's
+equilibrium, under gains where they follow, as if it were held there. The gains of plans made anew, or of a plan that
+moves on, are no law with an equilibrium of its own.
 
 A law that does not respond to small displacements, as at its limits, shows by turning back every few periods.
 """
@@ -11,7 +13,7 @@ A law that does not respond to small displacements, as at its limits, shows by t
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,7 +25,7 @@ from varpin.errors import AssemblyError, ControlError, LinearizationError, Singu
 from varpin.finding import Finding
 from varpin.integrators.explicit import accelerations
 from varpin.mechanics.assembly import nearest
-from varpin.mechanics.scene import Scene
+from varpin.mechanics.scene import Scene, closest_controls, tangent_basis
 from varpin.signals.functions import Copies
 from varpin.signals.responses import MEMORY, responses
 from varpin.simulation.spectrum import masses
@@ -36,10 +38,10 @@ logger = logging.getLogger(__name__)
 _NODES = 5
 # Iterations of Newton's method, and its last step [rad or m].
 _ITERATIONS, _CONVERGED = 30, 1e-8
+# Rank tolerance of the constraints in the metric of the kinetic energy, relative to the square of the largest.
+_RANK = 1e-9
 # Stiffness, as a share of the largest, below which a direction is free to stay anywhere.
 _SINGULAR = 1e-6
-# Rank tolerance of the constraints in the metric of the kinetic energy, relative to the largest singular value.
-_RANK = 1e-9
 # Least growth a period: rounding of differences may split double eigenvalues by 3e-6. 0 to 1e-5: the same.
 _GROWTH = 1e-5
 # The period causes growth if its exponent exceeds that in continuous time by this factor: 1.1 to 3 give the same.
@@ -57,6 +59,7 @@ class Gains(NamedTuple):
     """Linear feedback: gains (P, m, 2n) or, with columns for the previous control, (P, m, 2n + m), of each period."""
 
     rows: Floats
+    reference: Floats  # (P, 2n) at least, that the state follows
     momentum: bool  # on (q, p), else on (q, v)
 
 
@@ -68,13 +71,13 @@ class Loop:
         A: Rate of (y, y') by (y, y') (2f, 2f) [1/s].
         B: By u (2f, m).
         H: Of u by (y, y') of this period and those before (J, m, 2f).
-        kept: Ratio of the responses that follow the last of H.
+        kept: What each period multiplies the responses by that follow the last of H (m, m).
     """
 
     A: Floats
     B: Floats
     H: Floats
-    kept: float
+    kept: Floats
 
     def mode(self, period: float) -> tuple[float, Floats]:
         """Spectral radius over a period [s] with zero-order hold, and sizes of the controls in that mode (m,).
@@ -89,8 +92,8 @@ class Loop:
         step[:size] = held[:size, size:] @ control
         step[:size, :size] += held[:size, :size]
         step[J * size :] = 0.0
-        step[J * size :, (J - 1) * size : J * size] = self.kept * self.H[-1]
-        step[J * size :, J * size :] = self.kept * np.eye(m)
+        step[J * size :, (J - 1) * size : J * size] = self.kept @ self.H[-1]
+        step[J * size :, J * size :] = self.kept
         if not np.isfinite(step).all():
             return np.nan, np.zeros(m)
         factors, modes = np.linalg.eig(step)
@@ -100,8 +103,12 @@ class Loop:
     def grows(self, period: float) -> bool:
         """Whether the loop is unstable because of its period [s]."""
         radius, _ = self.mode(period)
-        rate = float(np.linalg.eigvals(self.A + self.B @ self.H.sum(axis=0)).real.max())
-        return radius > 1.0 + _GROWTH and bool(np.log(radius) > _BY_PERIOD * max(rate, 0.0) * period)
+        if not radius > 1.0 + _GROWTH:
+            return False
+        change = np.concatenate([self.kept @ self.H[-1], self.kept - np.eye(len(self.kept))], axis=1) / period
+        slow = np.block([[self.A + self.B @ self.H.sum(axis=0), self.B], [change]])
+        rate = float(np.linalg.eigvals(slow).real.max())
+        return bool(np.log(radius) > _BY_PERIOD * max(rate, 0.0) * period)
 
 
 def unstable_loop(
@@ -142,12 +149,6 @@ def _inside(u: Floats) -> Integers:
     return 1 + np.flatnonzero(clipped == clipped.min())
 
 
-def _centres(x: Floats) -> Floats:
-    """Means (P - 2, 2n) of three states of x (P, 2n), where oscillations by which controls alternate are at rest."""
-    means: Floats = 0.25 * (x[:-2] + 2.0 * x[1:-1] + x[2:])
-    return means
-
-
 def _turning(u: Floats) -> tuple[int, Integers]:
     """The control of u (P, m) that turns back most within a window, and the nodes at which it does, if it is often."""
     changes = np.diff(u, axis=0)
@@ -165,32 +166,12 @@ def _loops(
     # Commands of kinematic inputs are positions.
     if law is None or scene.inputs:
         return {}
-    middle, n = _centres(x), x.shape[1] // 2
-    centres = {k: middle[k - 1] for k in nodes}
-    given: Iterable[tuple[int, Floats, Floats]]
-    if isinstance(law, Gains):
-        given = ((k, u[k], _of_gains(scene, law, k, centres[k])) for k in nodes)
-    else:
-        given = responses(scene, law, t, x, u, centres)
-    found = {}
+    found: dict[int, Loop] = {}
     try:
-        for k, control, H in given:
-            known = H.any() and np.isfinite(H).all()
-            loop = _at_equilibrium(scene, x[0, :n], centres[k], control, H) if known else None
-            if loop is not None:
-                found[k] = loop
+        found.update(_of_gains(scene, law, nodes) if isinstance(law, Gains) else _of_law(scene, law, t, x, u, nodes))
     except (AssemblyError, SingularMassMatrix, ControlError, LinearizationError, np.linalg.LinAlgError) as error:
         logger.debug("a control law is differentiated at %d of %d states: %r", len(found), len(nodes), error)
     return found
-
-
-def _of_gains(scene: Scene, gains: Gains, k: int, state: Floats) -> Floats:
-    """The responses (J, m, 2n) of linear feedback at node k."""
-    n = len(state) // 2
-    K, G = np.split(gains.rows[k], [2 * n], axis=1)
-    if gains.momentum:
-        K = np.concatenate([K[:, :n], K[:, n:] @ masses(scene, state[None, :n])[0]], axis=1)
-    return np.array([np.linalg.matrix_power(G, i) @ K for i in range(MEMORY)]) if G.size else K[None]
 
 
 def _finding(scene: Scene, control: int, text: str, value: float, time: float | None = None) -> tuple[Finding, ...]:
@@ -232,43 +213,59 @@ def _by_turns(scene: Scene, x: Floats, u: Floats, t: Floats, control: int, turns
     return _finding(scene, control, text, float(len(turns)), float(t[turns[0]]))
 
 
-def _at_equilibrium(scene: Scene, start: Floats, centre: Floats, u: Floats, H: Floats) -> Loop | None:
-    """The loop at the equilibrium that Newton's method finds from ``start`` (n,), None if it finds none.
+def _of_gains(scene: Scene, gains: Gains, nodes: Sequence[int]) -> Iterator[tuple[int, Loop]]:
+    """The loops with linear feedback at nodes, about the states that it follows."""
+    for k in nodes:
+        n = scene.robot.dof
+        q, (K, G) = gains.reference[k, :n], np.split(gains.rows[k], [2 * n], axis=1)
+        if gains.momentum:
+            K = np.concatenate([K[:, :n], K[:, n:] @ masses(scene, q[None])[0]], axis=1)
+        if K.any():
+            q = nearest(scene, q) if scene.constraints else q
+            kept = G if G.size else np.zeros((len(K), len(K)))
+            yield k, _at_rest(scene, q, closest_controls(scene, q), K[None], kept)[0]
 
-    The law has the control u (m,) at the state ``centre`` (2n,) and the responses H (J, m, 2n) everywhere.
+
+def _of_law(
+    scene: Scene, law: Copies, t: Floats, x: Floats, u: Floats, nodes: Sequence[int]
+) -> Iterator[tuple[int, Loop]]:
+    """The loops with a law at nodes, about the equilibria that Newton's method finds from the motion's start.
+
+    Each is that of a law with the control and the responses of the node everywhere.
     """
-    q, K = start, H.sum(axis=0)
-    for _ in range(_ITERATIONS):
-        q = nearest(scene, q) if scene.constraints else q
-        a, aq, av, af, Z = _at_rest(scene, q, scene.actuation @ (u + K @ (np.append(q, np.zeros_like(q)) - centre)))
-        pushed, responses = af @ scene.actuation, H @ np.kron(np.eye(2), Z)
-        way = Z @ np.linalg.lstsq(aq + pushed @ (K[:, : len(q)] @ Z), -a, rcond=_SINGULAR)[0]
-        if np.abs(way).max() < _CONVERGED:
-            A = np.block([[np.zeros_like(aq), np.eye(len(aq))], [aq, av]])
-            kept = float(np.vdot(H[-1], H[-2]) / np.vdot(H[-2], H[-2])) if len(H) == MEMORY else 0.0
-            return Loop(A, np.concatenate([np.zeros_like(pushed), pushed]), responses, min(max(kept, 0.0), 1.0))
-        q = q + way / max(1.0, np.abs(way).max())
-    return None
+    n = scene.robot.dof
+    # Oscillations by which controls alternate are at rest in the mean of three states.
+    centres = {k: 0.25 * (x[k - 1] + 2.0 * x[k] + x[k + 1]) for k in nodes}
+    for k, control, H in responses(scene, law, t, x, u, centres):
+        q, K, kept = x[0, :n], H.sum(axis=0), np.zeros((len(control), len(control)))
+        if len(H) == MEMORY:
+            kept = np.clip(np.vdot(H[-1], H[-2]) / np.vdot(H[-2], H[-2]), 0.0, 1.0) * np.eye(len(control))
+        for _ in range(_ITERATIONS if H.any() and np.isfinite(H).all() else 0):
+            q = nearest(scene, q) if scene.constraints else q
+            loop, way = _at_rest(scene, q, control + K @ (np.append(q, np.zeros(n)) - centres[k]), H, kept)
+            if np.abs(way).max() < _CONVERGED:
+                yield k, loop
+                break
+            q = q + way / max(1.0, np.abs(way).max())
 
 
-def _at_rest(scene: Scene, q: Floats, force: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """The motion linearized at rest at q (n,) under a constant force (n,), in f coordinates y of its tangent space.
+def _at_rest(scene: Scene, q: Floats, u: Floats, H: Floats, kept: Floats) -> tuple[Loop, Floats]:
+    """The loop where a constant force holds q (n,) at rest beside controls u (m,), for responses H (J, m, 2n).
 
-    Accelerations of y (f,), their derivatives in y (f, f), in its rate (f, f) and in a force (f, n), and dq = Z dy
-    with Z'MZ = 1 and C Z = 0. The constraint forces C' lam are constant to first order in y, but for
-    their curvature lam . g_qq.
+    And the way (n,) of a step of Newton's method to where there is no such force. Changes of the state are dq = Z y and
+    dv = Z y'; constraint forces are constant to first order, but for their curvature lam . g_qq.
     """
-    still = np.zeros((1, len(q)))
-    a, aq, av, af = (part[0] for part in accelerations(scene, q[None], still, force[None]))
-    if not scene.constraints:
-        return a, aq, av, af, np.eye(len(q))
-    C = scene.core.constraints(np.ascontiguousarray(q[None]))[2][0]
-    root = np.linalg.cholesky(af)
-    left, sizes, right = np.linalg.svd(C @ root)
-    rank = int((sizes > _RANK * sizes.max(initial=0.0)).sum())
-    left, sizes, Z = left[:, :rank], sizes[:rank], root @ right[rank:].T
-    lam = -left @ ((left.T @ C @ a) / sizes**2)
-    a, aq, av, af = (part[0] for part in accelerations(scene, q[None], still, (force + C.T @ lam)[None]))
-    onto = Z.T @ np.linalg.inv(af)
-    curved = scene.core.constraint_curvature(q, lam, q)[0]
-    return onto @ a, onto @ (aq + af @ curved) @ Z, onto @ av @ Z, onto @ af, Z
+    M, Z = masses(scene, q[None])[0], tangent_basis(scene, q)
+    still, force = np.zeros((1, len(q))), (scene.actuation @ u)[None]
+    a, *_ = accelerations(scene, q[None], still, force)
+    _, aq, av, af = (part[0] for part in accelerations(scene, q[None], still, force - a @ M))
+    if scene.constraints:
+        C = scene.core.constraints(np.ascontiguousarray(q[None]))[2][0]
+        lam = np.linalg.lstsq(C @ af @ C.T, -C @ a[0], rcond=_RANK)[0]
+        aq = aq + af @ scene.core.constraint_curvature(q, lam, q)[0]
+    onto = np.linalg.solve(Z.T @ M @ Z, Z.T @ M)
+    aq, av, pushed = onto @ aq @ Z, onto @ av @ Z, onto @ af @ scene.actuation
+    H = H @ np.kron(np.eye(2), Z)
+    way = Z @ np.linalg.lstsq(aq + pushed @ H.sum(axis=0)[:, : len(aq)], -onto @ a[0], rcond=_SINGULAR)[0]
+    A = np.block([[np.zeros_like(aq), np.eye(len(aq))], [aq, av]])
+    return Loop(A, np.concatenate([np.zeros_like(pushed), pushed]), H, kept), way
