@@ -374,7 +374,7 @@ def jump(t):
 DOUBTS = {
     "clock of the log": ("milliseconds", lambda own: own | {"t": 1e3 * own["t"]}),
     "gap in the log": ("no samples for 1.01 s", lambda own: own | {"t": jump(own["t"])}),
-    "log in degrees": ("looks like degrees", lambda own: own | {"q": np.rad2deg(own["q"]) + 100.0 * np.arange(6)}),
+    "degrees": ("looks like degrees", lambda own: own | {"q": np.rad2deg(own["q"]) + 100.0 * np.arange(6)}),
     "log beyond limits": ("another order", lambda own: own | {"q": own["q"] + 6.0 * np.eye(6)[1]}),
     "dead encoder": ("'elbow_joint'", lambda own: own | {"q": own["q"] * (np.arange(6) != 2)}),
 }

@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 from findings import about
 from oracles import Mechanism, slope
-from refusals import naming, refused, unnamed
+from refusals import refused, unnamed
 
 import varpin as vp
 
@@ -244,13 +244,6 @@ def test_commands_are_not_coloured_as_torques(served, tmp_path):
     scene, motion = served
     with refused(vp.InputError, "controls", "servos"):
         vp.replay(scene.robot, motion, html=tmp_path / "served.html", marks=vp.Marks(torques=True))
-
-
-def test_gravity_in_millimetres_is_told(caplog):
-    vp.Scene(vp.planar_chain(1), gravity=[0.0, 0.0, -24.8])
-    assert not caplog.messages
-    vp.Scene(vp.planar_chain(1), gravity=[0.0, 0.0, -9810.0])
-    assert len(naming(caplog.messages, "gravity", "-9810.0", "mm/s^2")) == 1
 
 
 # --- those that a user writes ----------------------------------------------------------------------------------------
