@@ -3,10 +3,9 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from mechanisms import joint, link, mimic, random_tree, write_urdf
+from mechanisms import joint, link, mimic, random_tree, rod_chain, write_urdf
 
 import varpin as vp
-from varpin.model.chain import rod_chain
 
 GRAVITY = 9.81
 EPS = np.finfo(float).eps
