@@ -11,6 +11,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from mechanisms import rod_chain
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
@@ -20,7 +21,6 @@ from varpin.mechanics.noise import AdditiveNoise
 from varpin.mechanics.scene import Scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.model import Robot, load_robot
-from varpin.model.chain import rod_chain
 from varpin.simulation.spectrum import speed_scales, travel_scales
 from varpin.study import checks
 from varpin.study.checks import LEVELS

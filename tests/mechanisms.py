@@ -119,3 +119,27 @@ def random_tree(
     if armature:
         model.armature = rng.uniform(0.0, 0.1, model.nv)
     return model
+
+
+def rod_chain(lengths, masses, *, base=(0.0, 0.0, 0.0), armature=0.0, rail=None):
+    """A chain like ``planar_chain`` of rods of these lengths [m] and masses [kg], from ``base`` (3,) [m] on.
+
+    Every joint has an ``armature`` [kg m^2 or kg]; a carriage of mass ``rail`` [kg] slides along x and carries them.
+    """
+    model = pin.Model()
+    model.name = f"chain{len(lengths)}"
+    placement = pin.SE3(np.eye(3), np.array(base, dtype=float))
+    joint = 0
+    if rail is not None:
+        joint = model.addJoint(joint, pin.JointModelPX(), placement, "rail")
+        model.appendBodyToJoint(joint, pin.Inertia(rail, np.zeros(3), np.zeros((3, 3))), pin.SE3.Identity())
+        placement = pin.SE3.Identity()
+    for k, (length, mass) in enumerate(zip(lengths, masses, strict=True)):
+        across = mass * length**2 / 12.0
+        rod = pin.Inertia(mass, np.array([0.5 * length, 0.0, 0.0]), np.diag([0.0, across, across]))
+        joint = model.addJoint(joint, pin.JointModelRY(), placement, f"joint{k + 1}")
+        model.appendBodyToJoint(joint, rod, pin.SE3.Identity())
+        placement = pin.SE3(np.eye(3), np.array([length, 0.0, 0.0]))
+    model.armature = np.full(model.nv, armature)
+    model.addFrame(pin.Frame("tip", joint, 0, placement, pin.FrameType.OP_FRAME))
+    return vp.load_robot(model)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from logged import NAMES, NOISE, TRUTH, motion, start
 from refusals import naming, refused
 from ur5_logs import NAMES, NOISE, TRUTH, motion, start
 

@@ -8,12 +8,11 @@ import signal
 import numpy as np
 import pytest
 from findings import about
-from mechanisms import slider
+from mechanisms import rod_chain, slider
 from random_motions import draw, judge, truth
 from refusals import unnamed
 
 import varpin as vp
-from varpin.model.chain import rod_chain
 
 CHAIN, FREE = vp.planar_chain(3), vp.Scene(vp.planar_chain(3))
 Q0, V0 = np.array([0.3, 0.2, -0.4]), np.array([0.5, 0.0, 1.0])

@@ -6,11 +6,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import zoo
+from mechanisms import rod_chain
 from oracles import exact, off_constraints
 
 import varpin as vp
 from varpin.mechanics.assembly import along_constraints
-from varpin.model.chain import rod_chain
 
 
 def held(place, axes="xz"):

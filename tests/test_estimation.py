@@ -154,13 +154,15 @@ def test_a_linear_system_against_a_plain_filter_and_a_gaussian_of_all_samples(me
 
 @pytest.mark.parametrize("method", [vp.Gauss(2), vp.RungeKutta4()], ids=str)
 @pytest.mark.parametrize("name", ARMS)
-def test_process_covariance_is_that_of_the_continuous_equation(load, name, method):
+def test_the_covariance_of_a_step_is_that_of_the_continuous_equation(load, name, method):
     size, strength, damping = ARMS[name]
     scene = scene_of(load(name), strength, damping)
     n, h = scene.robot.dof, 0.005
     start = {"q0": np.linspace(0.3, -0.9, n), "v0": np.linspace(-1.0, 1.0, n), "controls": np.array(size)}
-    step = vp.simulate(scene, dt=h, steps=1, increments=0, integrator=method, check=False, **start)
-    found = vp.linearize(scene, step).process_covariance()[0]
+    # The samples of the log come after the step.
+    log = vp.Log(h * np.arange(4), np.where(np.arange(4)[:, None] < 2, np.nan, np.zeros(n)), np.tile(size, (4, 1)))
+    known = {"q0": start["q0"], "v0": start["v0"], "covariance": np.zeros((2 * n, 2 * n))}
+    found = vp.kalman_filter(scene, log, q_noise=1.0, integrator=method, **known).forward.predicted_covariance[1]
     fine = {"dt": h / 20, "steps": 20}
     by = vp.Midpoint(kick="held")
     drawn = vp.simulate_ensemble(scene, quantiles=[], paths=8000, rng=3, integrator=by, **start, **fine)
@@ -171,12 +173,10 @@ def test_process_covariance_is_that_of_the_continuous_equation(load, name, metho
     assert np.linalg.eigvalsh(found / np.outer(deviation, deviation)).min() > 1e-5
 
 
-def test_process_covariance_refuses_constraints():
+def test_a_filter_refuses_constraints():
     robot = vp.planar_chain(2)
     scene = vp.Scene(robot, noise=vp.AdditiveNoise(1.0), constraints=vp.JointTie("joint2", "joint1"))
     step = vp.simulate(scene, [0.0, 0.0], [0.0, 0.0], dt=H, steps=1, increments=0, integrator=vp.Midpoint())
-    with refused(vp.InputError, "without constraints"):
-        vp.linearize(scene, step).process_covariance()
     with refused(vp.InputError, "Kalman filter does not take scenes with constraints"):
         vp.kalman_filter(scene, step, q_noise=ENCODER)
 
@@ -242,8 +242,13 @@ def test_without_samples_the_filter_is_the_motion_and_its_linearization():
         model = vp.linearize(scene, motion)
         np.testing.assert_allclose(found.forward.transition[:18], model.A[:18], atol=1e-8)
         moments = found.given.covariance
-        for k, Q in enumerate(model.process_covariance()[:18]):
-            moments = model.A[k] @ moments @ model.A[k].T + Q
+        # White forces of intensity F add, over a step, the integral of r(s) r(s)^T, with r linear in s.
+        n = scene.robot.dof
+        jump = model.F if model.variational else np.linalg.solve(model.J[:, n:], model.K[:, n:] @ model.F)
+        late = np.concatenate([np.zeros_like(jump), jump], axis=1)
+        for A, end in zip(model.A[:18], late, strict=False):
+            middle, change = 0.5 * (A @ end + end), A @ end - end
+            moments = A @ moments @ A.T + H * (middle @ middle.T + change @ change.T / 12.0)
         np.testing.assert_allclose(found.forward.predicted_covariance[18], moments, rtol=1e-6, atol=1e-12)
     # Long steps are divided, and symplectic all the same.
     t = 0.3 * np.arange(20)
@@ -374,7 +379,7 @@ def jump(t):
 DOUBTS = {
     "clock of the log": ("milliseconds", lambda own: own | {"t": 1e3 * own["t"]}),
     "gap in the log": ("no samples for 1.01 s", lambda own: own | {"t": jump(own["t"])}),
-    "log in degrees": ("looks like degrees", lambda own: own | {"q": np.rad2deg(own["q"]) + 100.0 * np.arange(6)}),
+    "degrees": ("looks like degrees", lambda own: own | {"q": np.rad2deg(own["q"]) + 100.0 * np.arange(6)}),
     "log beyond limits": ("another order", lambda own: own | {"q": own["q"] + 6.0 * np.eye(6)[1]}),
     "dead encoder": ("'elbow_joint'", lambda own: own | {"q": own["q"] * (np.arange(6) != 2)}),
 }

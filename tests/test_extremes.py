@@ -8,13 +8,12 @@ import battery
 import numpy as np
 import pytest
 from battery import TRIALS, Bench, Trial, period_error
-from mechanisms import slider
+from mechanisms import rod_chain, slider
 
 import varpin as vp
 from varpin.cli import main
 from varpin.finding import Finding
 from varpin.mechanics.wiener import wiener_increments
-from varpin.model.chain import rod_chain
 from varpin.study import checks
 from varpin.study import extremes as robot_checks
 from varpin.study.checks import LEVELS

@@ -5,7 +5,6 @@ import logging
 
 import numpy as np
 import pytest
-from logged import DAMPING, MIDDLE, NAMES, NOISE, TRUTH, motion, start
 from refusals import naming, refused
 from ur5_logs import DAMPING, MIDDLE, NAMES, NOISE, TRUTH, motion, start
 

@@ -3,11 +3,10 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from mechanisms import built, joint, link, mimic, random_tree, write_urdf
+from mechanisms import built, joint, link, mimic, random_tree, rod_chain, write_urdf
 from oracles import assert_same_jet
 
 import varpin as vp
-from varpin.model.chain import rod_chain
 
 GRAVITY = 9.81
 EPS = np.finfo(float).eps

@@ -96,7 +96,8 @@ def test_moments_against_samples():
     samples = 50_000
     x = mean + rng.normal(size=(samples, 6)) * np.sqrt(np.diag(covariance))
     for j in range(lin.steps):
-        x = lin.step(j, x, np.zeros((samples, 3)), np.sqrt(lin.dt) * rng.normal(size=(samples, scene.processes)))
+        dw = np.sqrt(lin.dt) * rng.normal(size=(samples, scene.processes))
+        x = x @ lin.A[j].T + np.einsum("sai,si->sa", lin.G[j] + np.einsum("aib,sb->sai", lin.Gx[j], x), dw)
     deviation = x - x.mean(axis=0)
     products = deviation[:, :, None] * deviation[:, None, :]
     error = np.abs(x.mean(axis=0) - moments.mean[-1]) / (x.std(axis=0) / np.sqrt(samples))

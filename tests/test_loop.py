@@ -7,13 +7,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from findings import about
+from mechanisms import rod_chain
 from oracles import exact
 from refusals import naming, refused
 from scipy.linalg import expm
 from scipy.optimize import fsolve
 
 import varpin as vp
-from varpin.model.chain import rod_chain
 
 KIND = "unstable loop"
 

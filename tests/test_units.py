@@ -1,4 +1,4 @@
-"""What is said of joint values: limits that are passed, degrees and millimetres, each in the units of its joints."""
+"""What is said of joint values: limits that are passed and degrees, each in the units of its joints."""
 
 import numpy as np
 import pinocchio as pin
@@ -163,7 +163,7 @@ def test_other_positions_in_degrees(scene, caplog):
     vp.load_robot("ur5", lock={"elbow_joint": 90})
     vp.Scene(scene.robot, stiffness=1.0, rest=HOME)
     elbow, rest = caplog.messages
-    assert not unnamed(elbow, ("elbow_joint", "90", "looks like degrees", "np.deg2rad"))
+    assert not unnamed(elbow, ("elbow_joint", "90", "limits", "rad"))
     assert not unnamed(rest, ("rest", *FACTS))
     with refused(vp.InputError, "q0", *FACTS):
         moved(vp.Scene(scene.robot, constraints=[vp.PointOnPoint("tool0", [0.8, 0.1, 0.2])]), HOME)
@@ -178,28 +178,6 @@ def test_stops_in_degrees(caplog):
     assert naming(caplog.messages, "looks like degrees") == caplog.messages
 
 
-def ball(r, at, distance):
-    return vp.KeepClear(r, [vp.Obstacle.sphere(at, 0.1, "ball")], distance, links=["forearm_link"])
-
-
-@pytest.mark.parametrize("scale", [1000.0, 1.0])
-@pytest.mark.parametrize(
-    ("make", "named"),
-    [
-        (lambda r, k: ball(r, k * np.array([0.9, 0.5, 0.4]), 0.0), "ball"),
-        (lambda r, k: ball(r, [2.0, 0.5, 0.4], k * 0.1), ("KeepClear", "distance")),
-        (lambda r, k: vp.KeepOutOfSphere(r, "tool0", k * np.array([0.9, 0.3, 0.4]), 0.1), "KeepOutOfSphere"),
-        (lambda r, k: vp.KeepInHalfSpace(r, "tool0", [0.0, 0.0, 1.0], k * -0.3), "KeepInHalfSpace"),
-        (lambda r, k: vp.KeepInBox(r, "tool0", k * np.array([-0.9, -0.8, 0.1]), np.inf), "KeepInBox('tool0')"),
-        (lambda r, k: vp.KeepInSphere(r, "tool0", [0.1, 0.2, 0.3], k * 0.6), "KeepInSphere('tool0')"),
-    ],
-)
-def test_millimetres_in_obstacles_and_regions(scene, make, named, scale):
-    told = naming(planned(scene, np.deg2rad(HOME), REST, make(scene.robot, scale)), "millimetres")
-    assert told == naming(told, named)
-    assert bool(told) == (scale > 1.0)
-
-
 def test_references_along_a_plan_are_looked_at_too(scene):
     goal, cost = np.array([0.0, -90.0, 90.0, 0.0, 45.0, 0.0]), vp.ControlCost(1e-3)
     problem = vp.OptimalControlProblem(scene, cost, REST, REST, dt=0.05, steps=4)
@@ -207,32 +185,6 @@ def test_references_along_a_plan_are_looked_at_too(scene):
         for reference in (scale * goal, [scale * goal] * 5, lambda t, goal=scale * goal: goal):
             found = foreseen(problem.at(cost=cost + vp.TrackingCost(reference)))
             assert any(not unnamed(warning, FACTS) for warning in found) == told
-    place = vp.FramePositionCost(scene.robot, "tool0", lambda t: [400.0, 100.0, 500.0])
-    assert not unnamed(foreseen(problem.at(cost=cost + place))[0], ("'tool0'", "millimetres"))
-
-
-@pytest.mark.parametrize(
-    ("load", "facts"),
-    [
-        (
-            lambda k: vp.load_robot("ur5", payload=vp.Payload("tool0", 2.0, [0.0, 0.0, k * 0.25])),
-            ("payload", "'tool0'"),
-        ),
-        (lambda k: vp.load_robot("ur5", payload=vp.Payload("tool0", k * 2.0)), ("2000 kg", "grams")),
-        (lambda k: vp.Scene(vp.planar_chain(1), gravity=[0.0, 0.0, k * -24.8]), ("gravity", "-24800.0", "mm/s^2")),
-        (lambda k: vp.planar_chain(2, length=k * 0.5), ("'joint1' and 'joint2'", "500 m", "millimetres")),
-    ],
-)
-def test_sizes_in_millimetres_and_grams(load, facts, caplog):
-    load(1.0)
-    assert not caplog.records
-    load(1000.0)
-    assert len(naming(caplog.messages, facts)) == 1
-
-
-def test_a_payload_on_a_link_that_is_held_takes_nothing_from_the_robot(caplog):
-    vp.load_robot("ur5", lock={"shoulder_pan_joint": 0.0}, payload=vp.Payload("shoulder_link", 12.5))
-    assert not caplog.records
 
 
 # --- joint values by name, holding torques and gravity ---------------------------------------------------------------

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from mechanisms import crank_and_slider, random_tree, slider
+from mechanisms import crank_and_slider, random_tree, rod_chain, slider
 from oracles import Mechanism, Path
 
 import varpin as vp
-from varpin.model.chain import rod_chain
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,12 +58,8 @@ class Finding(str):
 
     @classmethod
     def of_entry(cls, entry: str) -> Finding:
-        """The finding of a file's entry; of varpin 0.1 that is the text alone."""
-        try:
-            values = json.loads(entry)
-            return cls(values.pop("kind"), values.pop("text"), **values)
-        except (ValueError, TypeError, AttributeError, KeyError):
-            return cls("", entry)
+        """The finding of a file's entry."""
+        return cls(**json.loads(entry))
 
 
 def and_more(number: int, what: str) -> str:

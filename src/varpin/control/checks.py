@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.constraints import KeepInBox, ReachFrame, WithinJointLimits
+from varpin.control.constraints import ReachFrame, WithinJointLimits
 from varpin.control.costs import TrackingCost
 from varpin.control.costs.base import BoundTerm
 from varpin.control.history import percent
@@ -26,21 +26,11 @@ from varpin.errors import VarpinError
 from varpin.finding import Finding, announce, ranked
 from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import closest_controls
-from varpin.model import (
-    ADVICE,
-    AFAR,
-    ASIDE,
-    IN_MILLIMETRES,
-    degrees_hint,
-    joint_unit,
-    longest_reach,
-    looks_like_degrees,
-    millimetres_hint,
-)
+from varpin.model import in_degrees, joint_unit
 from varpin.model.kinematics import FrameKinematics, reach
 from varpin.simulation.check import check
 from varpin.simulation.record import rollout
-from varpin.simulation.start import in_other_units
+from varpin.simulation.start import start_in_degrees
 from varpin.simulation.velocity_noise import wrong_spread
 
 logger = logging.getLogger(__name__)
@@ -49,8 +39,6 @@ logger = logging.getLogger(__name__)
 _PARTS = 4
 # Standard deviation of a velocity, in widths of its dry friction, up to which tanh is linear to 6 %.
 _LINEAR_FRICTION = 0.25
-# Angle of a swing under gravity from which on no step follows it [rad]: a quarter of a period.
-_QUARTER = 0.5 * np.pi
 
 
 def looked_at(solution: Solution) -> Solution:
@@ -87,24 +75,13 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
 
 
 def foreseen(problem: OptimalControlProblem) -> list[Finding]:
-    """Findings about a problem before any search; where values are in wrong units, these alone."""
-    goals = [*_goals(problem)]
-    units = [*in_other_units(problem.scene, problem.q0, problem.v0), *_in_milliseconds(problem), *_in_degrees(problem)]
-    units += [*_in_millimetres(problem), *(own for own in goals if own.kind == "goal in millimetres")]
-    return [*ranked(units)] or [*_starts_outside(problem), *goals, *_outside(problem), *_weights(problem)]
-
-
-def _in_milliseconds(problem: OptimalControlProblem) -> Iterator[Finding]:
-    """A step in which the stretched arm swings by a quarter of its period under gravity."""
-    robot, pull = problem.scene.robot, float(np.linalg.norm(problem.scene.gravity))
-    length = longest_reach(robot, slides=False)
-    angle = problem.dt * np.sqrt(pull / length) if length > 0.0 else 0.0
-    if angle > _QUARTER:
-        sentence = (
-            f"dt = {problem.dt:g} s may be in milliseconds, and times are in seconds: {robot.name} would swing by "
-            f"{angle:.3g} rad under gravity in one step"
-        )
-        yield Finding("step in milliseconds", sentence, value=problem.dt, unit="s")
+    """Findings about a problem before any search; where values look like degrees, these alone."""
+    return [*ranked(_in_degrees(problem))] or [
+        *_starts_outside(problem),
+        *_goals(problem),
+        *_outside(problem),
+        *_weights(problem),
+    ]
 
 
 def _starts_outside(problem: OptimalControlProblem) -> Iterator[Finding]:
@@ -134,12 +111,11 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
         most, root = reach(robot, kinematics), kinematics.links.tree.translation[0]
         away = float(np.linalg.norm((place - root) @ axes, axis=1).max())
         if away > most * (1.0 + TRACE):
-            far = away > AFAR * most
             sentence = (
                 f"{label} has its goal {away:.4g} m from the first joint, and the frame gets {most:.4g} m from there "
-                f"at most: {IN_MILLIMETRES if far else 'no motion gets there'}"
+                "at most: no motion gets there"
             )
-            yield Finding("goal in millimetres" if far else "goal out of reach", sentence)
+            yield Finding("goal out of reach", sentence)
 
 
 def _terms(problem: OptimalControlProblem) -> Iterator[BoundTerm]:
@@ -193,39 +169,15 @@ def _weights(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 
 def _in_degrees(problem: OptimalControlProblem) -> Iterator[Finding]:
-    """Goals, references and limits of joints that look like degrees."""
+    """The start, references and limits of joints that look like degrees."""
     robot = problem.scene.robot
+    yield from start_in_degrees(problem.scene, problem.q0, problem.v0)
     for term in _terms(problem):
         if term.subject == Subject.entries and term.of == 0:
-            most = np.take_along_axis(term.target, np.abs(term.target).argmax(axis=0)[None], axis=0)[0]
-            if sentence := degrees_hint(robot, "the reference of a TrackingCost", most):
-                yield Finding("goal in degrees", sentence)
+            yield from in_degrees(robot, "the reference of a TrackingCost", term.target)
     for own in problem.constraints:
-        if not isinstance(own, WithinJointLimits):
-            continue
-        # Limits of the robot's description are in radians, however wide.
-        given = np.isfinite(own.limits) & (own.limits != robot.position_limits) & ~robot.slides
-        most = np.where(given, np.abs(own.limits), 0.0).max(axis=0)
-        joint = int(np.argmax(most))
-        if looks_like_degrees(most[joint]):
-            name = robot.joint_names[joint]
-            sentence = f"{own.label} lets {name} turn to {most[joint]:.4g} rad, and looks like degrees: {ADVICE}"
-            yield Finding("limits in degrees", sentence)
-
-
-def _in_millimetres(problem: OptimalControlProblem) -> Iterator[Finding]:
-    """Regions and obstacles that are so far away at the start, or violated by so much, that they look like it."""
-    for i in problem.throughout:
-        bound, c = problem.bound_constraints[i], problem.at_start(i)
-        if bound.unit != "m" or isinstance(bound.source, WithinJointLimits):
-            continue
-        order = np.argsort(np.abs(c))
-        # One far side of a box may stand for none.
-        row = order[len(order) // 2] if isinstance(bound.source, KeepInBox) else order[-1]
-        name = f"{problem.label_of(bound.source)}: the distance at the start from {bound.rows[row]}"
-        plausible = ASIDE if c[row] > 0.0 else AFAR
-        if sentence := millimetres_hint(problem.scene.robot, {name: abs(float(c[row]))}, plausible):
-            yield Finding("places in millimetres", sentence)
+        if isinstance(own, WithinJointLimits):
+            yield from in_degrees(robot, f"{own.label}: the limit", own.limits)
 
 
 # The finished plan

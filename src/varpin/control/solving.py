@@ -26,7 +26,7 @@ from varpin.core.arrays import Commands
 from varpin.errors import InputError, VarpinError
 from varpin.finding import announce
 from varpin.mechanics.forces import of_kind
-from varpin.model import degrees_hint
+from varpin.model import in_degrees
 from varpin.signals.commands import as_moved, with_ends
 from varpin.signals.policy import LinearPolicy
 from varpin.simulation.choice import STIFF
@@ -280,16 +280,16 @@ def _path_of(problem: OptimalControlProblem, given: Any) -> _Path:
         given = given.q, given.v
     q, v = given if isinstance(given, tuple) and len(given) == 2 else (given, None)
     positions = finite_array("states", q, shape).copy()
-    units = degrees_hint(robot, "states: the position", positions[int(np.abs(positions).max(axis=1).argmax())])
+    units = in_degrees(robot, "states: the position", positions)
+    announce(logger, problem.scene.announced, problem.dt, units)
     off = np.abs(positions[0] - problem.q0)
     joint = int(off.argmax())
     if off[joint] > FEASIBLE:
-        raise InputError(
+        sentence = (
             f"states must begin at the problem's q0: joint {names[joint]!r} is at {positions[0, joint]:.6g} in their "
-            f"first row, and at {problem.q0[joint]:.6g} in q0{'; ' if units else ''}{units}"
+            f"first row, and at {problem.q0[joint]:.6g} in q0"
         )
-    if units:
-        logger.warning("%s", units)
+        raise InputError("; ".join((sentence, *units)))
     speeds = np.gradient(positions, problem.dt, axis=0) if v is None else finite_array("states: v", v, shape).copy()
     speeds[0] = problem.v0
     return positions, speeds

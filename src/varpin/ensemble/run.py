@@ -22,7 +22,7 @@ from varpin.mechanics.wiener import children
 from varpin.signals.controls import commands_of
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.choice import given_integrator, stronger, usual_integrator
-from varpin.simulation.start import in_other_units, on_constraints, time_steps
+from varpin.simulation.start import on_constraints, start_in_degrees, time_steps
 from varpin.support.checks import (
     JointValues,
     as_floats,
@@ -130,7 +130,7 @@ def simulate_ensemble(
     found = sums.run(executor, workers, progress)
     if len(sums.failures) == paths:
         raise VarpinError(sums.failing())
-    found = (*in_other_units(scene, start[0][0], start[1][0]), *moved, *_alike(scene, start), *found)
+    found = (*start_in_degrees(scene, start[0][0], start[1][0]), *moved, *_alike(scene, start), *found)
     announce(logger, scene.announced, dt, found)
     return sums.result(found)
 

@@ -18,7 +18,7 @@ from varpin.errors import FileError, InputError, UnknownJoint
 from varpin.finding import Finding, announce
 from varpin.io.archive import atomic_file, read_npz, save_npz
 from varpin.mechanics.scene import Scene
-from varpin.model import degrees_hint, joint_unit
+from varpin.model import in_degrees, joint_unit
 from varpin.support.checks import as_floats, is_file, path_like, require_finite, tuple_of
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
@@ -212,8 +212,8 @@ def _doubts(scene: Scene, t: Floats, q: Floats, u: Floats) -> Iterator[Finding]:
     lower, upper = scene.robot.position_limits
     beyond = np.maximum(lower - least, most - upper)
     far = int(np.argmax(beyond))
-    if sentence := degrees_hint(scene.robot, "q", np.where(-least > most, least, most)):
-        yield Finding("log in degrees", sentence)
+    if found := in_degrees(scene.robot, "q", q):
+        yield from found
     elif beyond[far] > _BEYOND:
         unit = joint_unit(scene.robot, far)
         text = f"q of {names[far]!r} is {beyond[far]:.3g} {unit} beyond its limits: columns may be in another order"

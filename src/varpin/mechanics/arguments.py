@@ -31,9 +31,6 @@ from varpin.support.checks import JointValues, as_floats, finite_array, is_one_o
 
 logger = logging.getLogger(__name__)
 
-# Gravity that no planet has, such as 9810 [m/s^2].
-_HEAVY = 100.0
-
 
 def gravity_of(gravity: ArrayLike | bool, robot: Robot) -> Floats:
     """Gravity (3,) [m/s^2] from the argument of a scene."""
@@ -46,9 +43,7 @@ def gravity_of(gravity: ArrayLike | bool, robot: Robot) -> Floats:
             f"gravity is a vector in world axes, z up [m/s^2], got the number {float(given):g}; did you mean "
             f"gravity={meant}?"
         )
-    if np.linalg.norm(vector := finite_array("gravity", given, (3,))) > _HEAVY:
-        logger.warning("gravity = %s m/s^2 is ten times that of the Earth and more: is it in mm/s^2?", vector.tolist())
-    return vector
+    return finite_array("gravity", given, (3,))
 
 
 def _warn_of_description(robot: Robot, name: str, what: str, *, gives: bool, asked: bool, decided: bool) -> None:

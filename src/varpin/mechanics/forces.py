@@ -24,7 +24,7 @@ from varpin.arrays import Floats, Mask
 from varpin.core import coupling_kinds, element_kinds
 from varpin.core.arrays import Coupling, Element
 from varpin.errors import InputError
-from varpin.model import Robot, degrees_hint
+from varpin.model import Robot, in_degrees
 from varpin.model.tree import place_of_frame
 from varpin.support.checks import JointValues, as_floats, finite_array, joint_array, rotation_matrix, word
 from varpin.support.frozen import Frozen
@@ -149,8 +149,8 @@ class JointForce(Force):
             refuse_where(name, numbers[name], acts & ~(numbers[name] > 0.0), "must be > 0")
         for name in (name for name in _SIGNED if name in numbers):
             places = np.where(acts & np.isfinite(numbers[name]), numbers[name], 0.0)
-            if units := degrees_hint(robot, f"{name} of the {type(self).__name__}", places):
-                logger.warning(units)
+            for finding in in_degrees(robot, f"{name} of the {type(self).__name__}", places):
+                logger.warning(finding)
         table = np.column_stack([numbers[name] for name in self.columns or numbers])
         return tuple(Element(type(self).__name__, int(c), tuple(table[c].tolist())) for c in np.flatnonzero(acts))
 

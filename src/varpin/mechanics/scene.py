@@ -165,9 +165,8 @@ class Scene(Frozen):
             object.__setattr__(self, name, value)
 
     def __getstate__(self) -> dict[str, Any]:
-        state = super().__getstate__()
         # A copy, possibly in another process, logs its warnings again.
-        return state | {"values": state["values"] | {"announced": set()}}
+        return super().__getstate__() | {"announced": set()}
 
     def __repr__(self) -> str:
         parts = [f"gravity {self.gravity.tolist()}" if self.gravity.any() else "no gravity"]

@@ -12,12 +12,6 @@ from varpin.model.robot import Robot as Robot
 from varpin.model.robot import geometry as geometry
 from varpin.model.robot import readable_geometry as readable_geometry
 from varpin.model.robot import require_robot as require_robot
-from varpin.model.units import ADVICE as ADVICE
-from varpin.model.units import AFAR as AFAR
-from varpin.model.units import ASIDE as ASIDE
-from varpin.model.units import IN_MILLIMETRES as IN_MILLIMETRES
-from varpin.model.units import degrees_hint as degrees_hint
+from varpin.model.units import in_degrees as in_degrees
 from varpin.model.units import joint_unit as joint_unit
 from varpin.model.units import longest_reach as longest_reach
-from varpin.model.units import looks_like_degrees as looks_like_degrees
-from varpin.model.units import millimetres_hint as millimetres_hint

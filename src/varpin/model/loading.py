@@ -19,7 +19,6 @@ from varpin.model.mimic import joint_index
 from varpin.model.robot import Robot, limits_of
 from varpin.model.sources import describe
 from varpin.model.tree import is_unbounded, joint_axis
-from varpin.model.units import ADVICE, looks_like_degrees, odd_sizes
 from varpin.support.checks import (
     JointValues,
     as_floats,
@@ -136,7 +135,6 @@ def unchecked_robot(
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise RobotError(f"robot {robot.name!r} has several joints named {', '.join(map(repr, twice))}")
     robot = hold_joints(robot, _locks(robot, lock, keep))
-    robot = robot.changed(faults=(*robot.faults, *odd_sizes(robot, payload)))
     return robot if armature is None else _with_rotors(robot, armature)
 
 
@@ -271,11 +269,8 @@ def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
     if kind.nv == 1:
         low, high, *_ = limits_of(model, joint)
         if low < high and not low - _OUTSIDE <= position[0] <= high + _OUTSIDE:
-            units = not joint_axis(model, joint)[0] and looks_like_degrees(position[0])
-            hint = f", and looks like degrees: {ADVICE}" if units else ""
-            logger.warning(
-                "%s = %g locks the joint outside its limits, %g and %g [rad or m]%s", name, position[0], low, high, hint
-            )
+            unit = "m" if joint_axis(model, joint)[0] else "rad"
+            logger.warning("%s = %g is outside the joint's limits, %g to %g %s", name, position[0], low, high, unit)
     if kind.nv > 1:
         reference = pin.neutral(model)
         reference[kind.idx_q : kind.idx_q + kind.nq] = position

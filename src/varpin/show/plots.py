@@ -89,19 +89,6 @@ def plot_velocities(trajectory: Motion, axes: Axes | None = None, *, robot: Robo
     return _draw(trajectory, trajectory.v, _of_joints(trajectory, robot, "velocity"), axes, limits)
 
 
-def plot_error(trajectory: Motion, axes: Axes | None = None, *, robot: Robot | None = None) -> Drawn:
-    """The estimated error of q over time, of a checked motion; arguments as for :func:`plot_joints`."""
-    trajectory = _require_motion(trajectory, robot)
-    if trajectory.error is None:
-        raise InputError("the motion has no error: it was simulated with check=False")
-    lines = _of_joints(trajectory, robot, "estimated error")
-    figure, axes = _draw(trajectory, trajectory.error, lines, axes)
-    if trajectory.error.any():
-        # The error is zero at the start.
-        axes.set_yscale("log")
-    return figure, axes
-
-
 def plot_controls(trajectory: Motion, axes: Axes | None = None, *, robot: Robot | None = None) -> Drawn:
     """Controls over time: step functions, or lines where they are linear between nodes; as :func:`plot_joints`.
 

@@ -26,11 +26,7 @@ from varpin.simulation.choice import given_integrator, usual_integrator
 from varpin.simulation.failures import Interrupted, StepFailure, named
 from varpin.simulation.loop import Gains, unstable_loop
 from varpin.simulation.record import MotionRecord, Progress, Reporter
-from varpin.simulation.start import (
-    in_other_units,
-    on_constraints,
-    time_steps,
-)
+from varpin.simulation.start import on_constraints, start_in_degrees, time_steps
 from varpin.simulation.tolerance import steps_for_tolerance
 from varpin.support.checks import JointValues, as_floats, count, flag, joint_array, positive, require_memory
 from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
@@ -204,8 +200,8 @@ def simulate(
             found = [*unstable, *wrong, *unsettled, *found, *motion.warnings]
         elif known is not None:
             motion = motion.with_error(known)
-        # Values in wrong units explain all else. Without controls servos hold the start.
-        found = [*in_other_units(scene, *given, motion.u), *found, *moved]
+        # Degrees explain all else. Without controls servos hold the start.
+        found = [*start_in_degrees(scene, *given, motion.u), *found, *moved]
         motion = motion.changed(warnings=ranked(found), accuracy=accuracy)
     except KeyboardInterrupt:
         raise Interrupted(motion.changed(accuracy=accuracy)) from None

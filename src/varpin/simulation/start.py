@@ -1,4 +1,4 @@
-"""What a motion is given: its start, moved onto the constraints, its time step, and units that look wrong."""
+"""What a motion is given: its start, moved onto the constraints, its time step, and angles that look like degrees."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from varpin.errors import InputError
 from varpin.finding import Finding
 from varpin.mechanics.assembly import along_constraints, dependent_input, missed, nearest
 from varpin.mechanics.scene import CORRECTED, Scene
-from varpin.model import degrees_hint, joint_unit
+from varpin.model import in_degrees, joint_unit
 from varpin.support.checks import count, positive
 from varpin.trajectory import Trajectory
 
@@ -21,16 +21,10 @@ _ROUNDING = 1e-9
 _MULTIPLE = 1e-9
 
 
-def in_other_units(scene: Scene, q0: Floats, v0: Floats, controls: Floats | None = None) -> tuple[Finding, ...]:
+def start_in_degrees(scene: Scene, q0: Floats, v0: Floats, controls: Floats | None = None) -> tuple[Finding, ...]:
     """A warning of an initial state (n,), (n,) that looks like degrees, else of such positions in controls (N, m)."""
-    if sentence := degrees_hint(scene.robot, "q0", q0) or degrees_hint(scene.robot, "v0", v0, speed=True):
-        return (Finding("start in degrees", sentence),)
-    if controls is None or not len(controls) or not scene.holding.any():
-        return ()
-    positions = controls @ scene.holding
-    most = positions[np.abs(positions).argmax(axis=0), np.arange(positions.shape[1])]
-    sentence = degrees_hint(scene.robot, "the position in controls", most)
-    return (Finding("controls in degrees", sentence),) if sentence else ()
+    found = in_degrees(scene.robot, "q0", q0) or in_degrees(scene.robot, "v0", v0, speed=True)
+    return found if found or controls is None else in_degrees(scene.robot, "controls", controls @ scene.holding)
 
 
 def on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Floats, tuple[Finding, ...]]:
@@ -42,11 +36,11 @@ def on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Floats
     """
     label, miss = missed(scene, q0)
     if miss > CORRECTED:
-        units = degrees_hint(scene.robot, "q0", q0)
-        raise InputError(
+        sentence = (
             f"q0 misses {label} by {miss:.4g} m or rad: varpin.assemble(scene, q0) looks for the nearest configuration "
-            f"that keeps the constraints{'; ' if units else ''}{units}"
+            "that keeps the constraints"
         )
+        raise InputError("; ".join((sentence, *in_degrees(scene.robot, "q0", q0))))
     q = nearest(scene, q0)
     if (twice := dependent_input(scene, q)) is not None:
         raise InputError(f"{twice} moves a joint that the other constraints and inputs move already at q0")

@@ -16,7 +16,7 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.errors import FileError, InputError, VarpinError, suggestion
-from varpin.model import Robot, looks_like_degrees
+from varpin.model import Robot
 from varpin.support.checks import finite, is_file
 
 _T = TypeVar("_T")
@@ -167,15 +167,7 @@ class Where:
         if isinstance(given, str):
             with self.named():
                 return robot.posture(given)
-        found = self.numbers(given, robot.joint_names)
-        self.refuse_degrees(found, robot.joint_names, robot.slides.tolist())
-        return found
-
-    def refuse_degrees(self, values: Floats, names: Sequence[str], slides: Sequence[bool]) -> None:
-        """Refuse positions of joints that look like degrees."""
-        for name, value, slide in zip(names, values.tolist(), slides, strict=True):
-            if not slide and looks_like_degrees(value):
-                raise self.error(f"{value:g} of {name!r} looks like degrees: angles are in rad")
+        return self.numbers(given, robot.joint_names)
 
 
 def _shown(value: object) -> str:

@@ -257,10 +257,6 @@ def _one(where: Where, given: Any) -> Robot:
     if isinstance(folders, list) and folders:
         own["package_dirs"] = [where.at("package_dirs", k).beside(folder) for k, folder in enumerate(folders)]
     own["payload"] = [place.call(Payload, load) for place, load in where.tables(own, "payload")]
-    lock = own.get("lock", {})
-    for joint, value in lock.items() if isinstance(lock, dict) else ():
-        if isinstance(value, int | float):
-            where.at("lock", joint).refuse_degrees(np.array([value]), [joint], [False])
     try:
         return where.call(load_robot, own)
     except SceneFileError as error:
@@ -429,7 +425,7 @@ def _target(
     task: Task, where: Where, kind: str, own: dict[str, Any], names: Sequence[str], what: str, keep: Any
 ) -> dict[str, Any]:
     """The target of a term by its key, from the keys of its table, which lose it; of the components to ``keep``."""
-    key, robot = kinds.target_key(kind), task.scene.robot
+    key = kinds.target_key(kind)
     hold, given, at = own.pop("hold", None), own.pop(key, None), where.at(key)
     if hold is not None and given is not None:
         raise where.error(f"hold and {key} exclude each other: give one of them")
@@ -443,7 +439,5 @@ def _target(
     turned = kind == "frame_orientation"
     reader = task.reader(at, kinds.ANGLES if turned else names, what)
     target = timeline(0.0 if given is None else given, reader, keep)
-    if kind == "tracking" and target.constant:
-        at.refuse_degrees(target(0.0), robot.joint_names, robot.slides.tolist())
     value: Any = partial(_turned_at, target) if turned else target
     return {key: value(0.0) if target.constant else value}
