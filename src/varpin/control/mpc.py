@@ -442,8 +442,8 @@ class _Loop:
         if slow > _FEW * len(ticks):
             text = (
                 f"planning took longer than {1e3 * limit:.3g} ms in {slow} of {len(ticks)} ticks "
-                f"({1e3 * seconds.mean():.3g} ms in the mean). Use fewer steps, fewer iterations, a larger budget or a "
-                "longer period (hold=)"
+                f"({1e3 * seconds.mean():.3g} ms in the mean). Use fewer steps, fewer iterations or a longer "
+                "period (hold=)"
             )
             yield Finding("late plans", text)
         if failed:
