@@ -322,6 +322,13 @@ def test_another_scene_is_refused_by_what_differs(load, name, tmp_path):
             vp.linearize(one, motion_of(other))
 
 
+def test_another_function_is_refused_by_what_it_makes_of_the_first_step(load):
+    one, other = (vp.Scene(load("ur5"), forces=vp.CustomForce(lambda q, v, k=k: k * v)) for k in (-0.5, -0.6))
+    assert vp.linearize(one, motion_of(one)).steps == 5
+    with refused(vp.InputError, "first step differs"):
+        vp.linearize(other, motion_of(one))
+
+
 @pytest.mark.parametrize("rows", [[], [[0.0, 3.0, 5.0, 0.7]]], ids=["idle", "acting"])
 def test_forces_of_another_core_are_refused_by_name(load, rows, tmp_path):
     """A core with a force of one's own stores it under its name, without rows where it did not act."""

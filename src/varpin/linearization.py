@@ -18,11 +18,15 @@ from varpin.integrators.base import noise_fields
 from varpin.integrators.registry import require_motion, require_scene_of
 from varpin.mechanics.noise import Fields, ito_drift, over_steps
 from varpin.mechanics.scene import Scene, require_scene
+from varpin.signals.commands import open_line, open_loop
 from varpin.simulation.choice import given_integrator
 from varpin.simulation.velocity_noise import wrong_spread
 from varpin.support.checks import as_floats, finite_array
 from varpin.support.differences import slopes
 from varpin.trajectory import Trajectory
+
+# Difference of the end of a step from the recorded one, as shares of its change of velocity and of its speed: rounding.
+_SAME, _OF_SPEED = 1e-5, 1e-8
 
 logger = logging.getLogger(__name__)
 
@@ -332,7 +336,25 @@ def matching_integrator(scene: Scene, trajectory: Trajectory, given: Integrator 
     require_motion(scene, trajectory)
     integrator = _integrator_of(scene, trajectory, given)
     require_scene_of(scene, trajectory)
+    if scene.custom is not None or "constraints.custom" in scene.values or not trajectory.scene_values:
+        _require_first_step(scene, trajectory, integrator)
     return integrator
+
+
+def _require_first_step(scene: Scene, trajectory: Trajectory, integrator: Integrator) -> None:
+    """Refuse a motion whose first step, if it is undivided, is another one in a scene with functions of one's own."""
+    if not trajectory.steps or trajectory.statistics.substeps[0] > 1:
+        return
+    first = trajectory.part(0, 1)
+    commands = open_loop(first.u)._replace(within=first.u_stages if first.u_stages.shape[1] else first.u_stages[:0])
+    if first.u_nodes.shape[1]:
+        commands = open_line(first.u_nodes, integrator.stage_times)
+    state, _ = integrator.start(scene, first.q[:1].copy(), first.v[:1].copy())
+    drawn = first.dw[None] if trajectory.noisy else first.dw[None, :0][:0]
+    (again,) = integrator.rollout(scene, state, commands, drawn, first.dt)
+    off, change = np.abs(again.v[0] - first.v[1]).max(), np.abs(np.diff(first.v, axis=0)).max()
+    if again.failure is not None or not off <= _SAME * change + _OF_SPEED * np.abs(first.v).max():
+        raise InputError("the trajectory was made in another scene than the one given: its first step differs")
 
 
 def _integrator_of(scene: Scene, trajectory: Trajectory, given: Integrator | None) -> Integrator:
