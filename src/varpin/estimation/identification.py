@@ -47,7 +47,7 @@ _SURE, _MISFIT = 4.0, 2.0
 # Deviations by which the logs ask for less than a least value that are told: zeros with noise are nearly always nearer.
 _PULLED = 3.0
 # Doubts about a log from which no value could be right.
-_NEVER = ("dead encoder", "clock of the log", "log in degrees")
+_NEVER = ("dead encoder", "clock of the log", "degrees")
 
 logger = logging.getLogger(__name__)
 

@@ -74,6 +74,18 @@ def _to_free_leader(tie: Tie, ties: dict[int, Tie], model: pin.Model) -> Tie:
     raise RobotError(f"joint {model.names[tie.follower]!r} mimics itself through a loop of mimic joints")
 
 
+def depth_first(model: pin.Model) -> list[int]:
+    """The joints, subtree by subtree, as Pinocchio's algorithms need them."""
+    children: list[list[int]] = [[] for _ in model.parents]
+    for joint in range(model.njoints - 1, 0, -1):
+        children[model.parents[joint]].append(joint)
+    order, stack = [], [0]
+    while stack:
+        order.append(joint := stack.pop())
+        stack += children[joint]
+    return order[1:]
+
+
 def of_mimics(model: pin.Model) -> tuple[tuple[Tie, ...], dict[int, pin.JointModel]]:
     """The ties of a model's mimic joints, and independent joints in their place."""
     ties, free = [], {}

@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from varpin.errors import FileError, InputError, RobotError
 from varpin.model.equalities import Closure
-from varpin.model.mimic import JOINT_PARAMETERS, POSITION_LIMITS, joint_frames, of_mimics, ties_of
+from varpin.model.mimic import JOINT_PARAMETERS, POSITION_LIMITS, depth_first, joint_frames, of_mimics, ties_of
 from varpin.model.mjcf import is_mjcf, read_mjcf
 from varpin.model.names import find
 from varpin.model.packages import Files, Packages
@@ -86,11 +86,11 @@ def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) ->
     shapes = visuals.copy() if visuals is not None else None
     ties, kinds = of_mimics(model)
     robot = Robot(name, model.copy(), ties, visuals=shapes, group_states=reference_postures(model))
-    # Subtree by subtree, as Pinocchio's algorithms need the joints.
-    order = sorted(range(1, model.njoints), key=lambda joint: list(model.supports[joint]))
+    order = depth_first(model)
     if kinds or order != sorted(order) or len(joint_frames(model)) < model.njoints - 1:
         robot = robot.rebuilt(order=order, kinds=kinds)
     if order != sorted(order):
+        # Pinocchio accepts joints in any order, but then computes a wrong mass matrix silently.
         logger.warning(
             "the joints of model %r were not added subtree by subtree, as Pinocchio's algorithms need: reordered to %s",
             name,
