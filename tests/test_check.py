@@ -309,7 +309,7 @@ def test_limits():
         assert told.value == pytest.approx(excess.max())
         assert told.time == pytest.approx(motion.t[int(excess[:, worst].argmax())])
         count = int((excess.max(axis=0) > 1e-6).sum()) - 1
-        assert not unnamed(told, f"'{told.joint}'", f"{limit[worst]:.4g} {unit}", f"by {told.value:.3g}")
+        assert not unnamed(told, f"'{told.joint}'", f"{limit[worst]:.4g} {unit}", f"by up to {told.value:.3g}")
         assert told.endswith((f"{count} more joint does", f"{count} more joints do") if count else "")
         assert len(told) <= 240
 
