@@ -24,7 +24,7 @@ import numpy as np
 import plans
 
 import varpin as vp
-from varpin.linearization import linearize_steps, node_jets, velocity_at_nodes
+from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.signals.commands import open_loop
 
 TASKS = (
@@ -144,7 +144,7 @@ class Transcription:
     def nodes(self, z):
         """The motion that the variables are, as one of the problem's: its steps need not end at its nodes."""
         q, v, u = self.motion(z)
-        M, _ = node_jets(self.problem.scene, q, v)
+        M, _ = self.problem.scene.core.jets(q, v)
         p = np.einsum("Nij,Nj->Ni", M, v)
         return replace(self.first, q=q, v=v, p=p, u=u), M
 
@@ -173,7 +173,7 @@ class Transcription:
         # From (q, v) to (q, p) where a step begins, and back where it ends.
         begin, end = np.zeros((self.N, x, x)), np.zeros((self.N, x, x))
         begin[:, :n, :n] = end[:, :n, :n] = np.eye(n)
-        begin[:, n:, :n], begin[:, n:, n:] = node_jets(scene, motion.q[:-1], motion.v[:-1])[1], M[:-1]
+        begin[:, n:, :n], begin[:, n:, n:] = scene.core.jets(motion.q[:-1], motion.v[:-1])[1], M[:-1]
         end[:, n:] = velocity_at_nodes(scene, *self.ends)
         J = np.zeros((self.N, x, self.places.shape[1]))
         J[:, :, :x], J[:, :, x : 2 * x], J[:, :, 2 * x :] = end @ lin.A @ begin, -np.eye(x), end @ lin.B

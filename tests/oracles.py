@@ -302,7 +302,7 @@ def same(one: object, other: object) -> bool:
         return list(one) == list(other) and all(same(one[key], other[key]) for key in one)
     if isinstance(one, tuple | list):
         return len(one) == len(other) and all(map(same, one, other))
-    return one == other or repr(one) == repr(other)  # as NaN
+    return one == other or (one != one and other != other)  # noqa: PLR0124 - NaN
 
 
 def normals(own: vp.Constraint) -> np.ndarray:

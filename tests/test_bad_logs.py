@@ -46,7 +46,10 @@ def test_what_no_value_could_be_right_from_is_refused(what):
 
 WARNED = {
     "a clock that is fast by 1 %": (lambda t, q, u: (1.01 * t, q, u), ("clock", "q_noise")),
-    "an encoder with its sign turned": (lambda t, q, u: (t, q * [1, 1, -1, 1, 1, 1], u), ("column", "q_noise")),
+    "an encoder with its sign turned": (
+        lambda t, q, u: (t, q * [1, 1, -1, 1, 1, 1], u),
+        ("'elbow_joint'", "opposite sign"),
+    ),
     "columns in another order": (lambda t, q, u: (t, q[:, ORDER], u[:, ORDER]), ("column", "q_noise")),
     "an encoder that dies": (lambda t, q, u: (t, spoiled(q, np.s_[70:, 3], q[70, 3]), u), ("q_noise",)),
 }

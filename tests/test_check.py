@@ -163,7 +163,7 @@ def test_of_falls_whose_deviations_grow_a_step_is_named_that_follows_them_or_a_s
     right = round(told.time / motion.dt)
     assert apart.max() > float(growth) * apart[:right].max()
     (told,) = about(moved(scene, steps=500, start=start).warnings, "error")
-    assert "or a shorter duration, as even rounding errors grow" in told
+    assert "and a shorter duration, as even rounding errors grow" in told
 
 
 def test_swings_are_not_called_sensitive():

@@ -266,6 +266,7 @@ def test_every_integrator_is_known_and_has_a_name_in_scene_files():
         ("Verlet", ("'Verlet'", "Midpoint", "Gauss", "Radau")),
         ("Gauss(alpha=0.5)", ("Gauss", "'alpha'", "stages")),
         ("RungeKutta4(4)", "RungeKutta4"),
+        ("varpin.Gauss(3)", ("written as a name", "Gauss(stages=3)")),
         ("Gauss(2, stages=3)", "Gauss"),
         ("Gauss(stages=9)", ("stages", "6", "9")),
         ("Gauss(stages=len([]))", "'len"),

@@ -188,7 +188,7 @@ def test_what_is_refused_and_interrupted(caplog):
             vp.identify(scene, right, NAMES, **({"q_noise": NOISE} | wrong))
     for logs, names, facts in [
         ([], NAMES, ("logs", "empty")),
-        (None, NAMES, ("logs", "None")),
+        (None, NAMES, ("logs", "varpin.Log", "None")),
         (right, [], ("parameters", "empty")),
     ]:
         with refused(vp.InputError, *facts):

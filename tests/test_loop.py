@@ -317,6 +317,21 @@ def test_policies():
     assert not told(motion), motion.warnings
 
 
+@pytest.mark.parametrize(("goal", "other", "rate"), [([0.5, 2.9], 0.0, 12.0), ([0.0, 0.0], 2.9, 15.0)])
+def test_a_policy_is_the_same_about_any_reference(goal, other, rate):
+    """One that holds the goal, and as the same function of the state about a place where another inertia acts."""
+    scene, N = vp.Scene(vp.planar_chain(2), gravity=False, damping=0.1), 100
+    M = vp.lagrangian_jet(scene, np.zeros(2), np.zeros(2)).Lvv
+    K = -np.hstack([rate**2 * M, 1.4 * rate * M])
+    size = radius(scene, K, 0.02, np.array(goal))
+    for x in (np.array(goal), np.array([0.0, other])):
+        u, reference = np.tile(K[:, :2] @ (x - goal), (N, 1)), np.tile([*x, 0.0, 0.0], (N, 1))
+        policy = vp.LinearPolicy(u, np.tile(K, (N, 1, 1)), reference, on="velocity")
+        motion = run(scene, np.add(goal, 0.01), [0, 0], policy, dt=0.02, steps=N, integrator=vp.RungeKutta4())
+        found = [finding.value for finding in told(motion)]
+        np.testing.assert_allclose(found, [size] if size > 1.0 else [], rtol=1e-5)
+
+
 @pytest.mark.parametrize(("kd", "kept"), [(60.0, 0.0), (60.0, 0.4), (60.0, 0.9), (60.0, -0.3), (100.0, 0.4)])
 def test_a_policy_on_the_control_before(kd, kept):
     """The step of (q, v, u) has its spectral radius."""

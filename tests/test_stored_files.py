@@ -1,4 +1,4 @@
-"""Files of every kind of record: those of varpin 0.1 are read, and damaged or foreign ones are refused by name."""
+"""Files of every kind of record: damaged or foreign ones are refused by name."""
 
 import copy
 import dataclasses
@@ -116,6 +116,11 @@ def test_any_damaged_byte_is_an_error_or_harmless(name, tmp_path):
                 members_of(name), {**sound, **{k: v for k, v in read_npz(path).items() if k in sound}}
             )
     assert refusals > 15
+
+
+@pytest.mark.parametrize("entry", ["x", "[1]", "3", '{"kind": "a"}', '{"kind": "a", "text": "b", "odd": 1}'])
+def test_damaged_warnings(entry, tmp_path):
+    unread("trajectory.npz", changed(tmp_path, "trajectory.npz", warnings=np.array([entry])), "warnings")
 
 
 # The last part of the names of entries that may be missing.
@@ -380,6 +385,9 @@ def arrays_in(x):
 def goes_round(x, use):
     """Each way keeps the arrays of ``x``, and what ``use`` makes of it."""
     expected = use(x)
+    writable = {where: array.flags.writeable for where, array in arrays_in(x).items()}
+    copy.copy(x)
+    assert writable == {where: array.flags.writeable for where, array in arrays_in(x).items()}
     for way in WAYS:
         back = way(x)
         for where, array in arrays_in(back).items():

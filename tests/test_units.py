@@ -163,7 +163,7 @@ def test_other_positions_in_degrees(scene, caplog):
     vp.load_robot("ur5", lock={"elbow_joint": 90})
     vp.Scene(scene.robot, stiffness=1.0, rest=HOME)
     elbow, rest = caplog.messages
-    assert not unnamed(elbow, ("elbow_joint", "90", "limits", "rad"))
+    assert not unnamed(elbow, ("elbow_joint", "90", "looks like degrees"))
     assert not unnamed(rest, ("rest", *FACTS))
     with refused(vp.InputError, "q0", *FACTS):
         moved(vp.Scene(scene.robot, constraints=[vp.PointOnPoint("tool0", [0.8, 0.1, 0.2])]), HOME)

@@ -67,7 +67,6 @@ class Linearization:
             linear between nodes, dx1 = A dx + (B - ramp) du_k + ramp du_(k+1).
         Gramp: Derivative of G in such a change (N, 2n, k, m); None where ``ramp`` is.
         warnings: Where moments of velocities are wrong, as damping is fast for the step; from :func:`linearize`.
-        constrained: Whether the scene has constraints; from :func:`linearize`.
     """
 
     A: Floats
@@ -83,7 +82,6 @@ class Linearization:
     ramp: Floats | None = None
     Gramp: Floats | None = None
     warnings: tuple[str, ...] = ()
-    constrained: bool = False
 
     def __repr__(self) -> str:
         states, controls = self.B.shape[1:]
@@ -122,7 +120,7 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
         # From a jump of the velocity to one of the momentum.
         M, _ = scene.core.jets(trajectory.q[:-1], trajectory.v[:-1])
         found = replace(found, K=found.J @ np.linalg.inv(M))
-    return replace(found, warnings=wrong_spread(scene, integrator, trajectory), constrained=bool(scene.constraints))
+    return replace(found, warnings=wrong_spread(scene, integrator, trajectory))
 
 
 def linearize_steps(

@@ -51,7 +51,7 @@ class BoundBetween(BoundConstraint):
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """See :meth:`BoundConstraint.value`; for one motion. Infinite where a step fails in parts."""
         if self.ends is None:
-            return self.of.of_states(*self._states(q, v))
+            return self.of.of_states(*self._states(q, v), u.shape[-1])
         found: Floats = self._in_parts(_given(self.problem, q, v, u, self.places - 1)[None])[0]
         return found
 
@@ -63,7 +63,8 @@ class BoundBetween(BoundConstraint):
         if parts is None:
             return np.full((S, *self.shape), np.inf)
         steps = (x.reshape(S, len(first), *x.shape[1:])[:, index] for x in parts)
-        found = self.ends.of_states(*(x.reshape(S, -1, x.shape[3]) for x in steps))
+        q, v = (x.reshape(S, -1, x.shape[3]) for x in steps)
+        found = self.ends.of_states(q, v, self.problem.scene.controls)
         return _on_parabolas(found.reshape(S, len(self.places), -1, len(self.rows)), self.moments)
 
     def slopes(self, q: Floats, v: Floats, u: Floats) -> Floats:
@@ -229,7 +230,7 @@ def _seen(problem: OptimalControlProblem, motion: Trajectory) -> dict[int, Float
         return found
     q, v = (x.reshape(-1, x.shape[2]) for x in parts)
     for i in watched(problem):
-        values = problem.bound_at(i, _times(problem, steps)).of_states(q, v)
+        values = problem.bound_at(i, _times(problem, steps)).of_states(q, v, problem.scene.controls)
         found[i] = values.reshape(len(steps), PARTS + 1, -1)
         if (found[i][0, 0] > FEASIBLE).any():
             found[i][0] = -np.inf

@@ -29,7 +29,7 @@ class Status(Enum):
     )
     INFEASIBLE = (
         "infeasible: plan.reason names the constraint; a start that leads around an obstacle (states=), a smaller dt, "
-        "a wider dry friction (CoulombFriction(width=)), a longer horizon or wider limits may help"
+        "a longer horizon, wider limits or, of dry friction, a larger CoulombFriction(width=) may help"
     )
     OUT_OF_TIME = "stopped at the time limit: this is the best motion so far"
     INTERRUPTED = "interrupted: this is the best motion so far"
@@ -114,7 +114,8 @@ class SearchState:
 
 def percent(part: float) -> str:
     """A fraction as text, to a ten-thousandth of a percent."""
-    return f"{round(100.0 * part, 4) + 0.0:+.3g} %"
+    value = round(100.0 * part, 4) + 0.0
+    return f"{value:+.{'3g' if abs(value) < 100.0 else '0f'}} %"
 
 
 @dataclass(frozen=True)

@@ -411,7 +411,7 @@ class _Loop:
         policy = plan.shifted(plan.problem.decisions - 1, x="velocity") if ended else plan.policy_on("velocity")
         row = 0 if ended else age
         self.feedback.append(policy.feedback[row])
-        self.reference.append(policy.reference[row])
+        self.reference.append(policy.reference[row, : len(q)])
         self.applied = policy.control(row, np.concatenate([q, v]), before)
         for bound in plan.problem.bound_constraints:
             if isinstance(bound, BoundRate) and before is not None:
@@ -431,7 +431,7 @@ class _Loop:
     def unstable(self, motion: Trajectory) -> tuple[Finding, ...]:
         """The warning of a loop that is unstable at its period, under the feedback of each tick if it is held."""
         held = not self.problem.linear
-        gains = Gains(np.array(self.feedback), np.array(self.reference), momentum=False) if held else None
+        gains = Gains(np.array(self.feedback), momentum=False, reference=np.array(self.reference)) if held else None
         return unstable_loop(self.plant.scene, motion, self.plant.substeps, gains)
 
     def without_plans(self) -> Iterator[Finding]:

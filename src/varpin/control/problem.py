@@ -413,7 +413,8 @@ class OptimalControlProblem(Frozen):
 
     def at_start(self, index: int) -> Floats:
         """The rows of a constraint ``throughout`` at the fixed start."""
-        start: Floats = self.bound_at(index, np.array([self.t0])).of_states(self.q0[None], self.v0[None])[0]
+        bound = self.bound_at(index, np.array([self.t0]))
+        start: Floats = bound.of_states(self.q0[None], self.v0[None], self.scene.controls)[0]
         return start
 
     def label_of(self, constraint: PlanConstraint) -> str:

@@ -74,6 +74,8 @@ class Shared(Frozen):
         steps = max(1, self.steps)
         size = min(max(math.ceil(paths / _CHUNKS), _LEAST_STEPS // steps), _MOST_STEPS // steps, _MOST_PATHS)
         size = max(size, _FEWEST_PATHS) if size <= _GROUP else math.ceil(size / _GROUP) * _GROUP
+        # Paths whose noise Python evaluates are slow: single ones for Ctrl-C and progress.
+        size = 1 if self.scene.noise.own else size
         return ((first, min(first + size, paths)) for first in range(0, paths, size))
 
     def shape(self, name: str) -> tuple[int, ...]:
@@ -189,7 +191,7 @@ def examine(task: tuple[Shared, int, Floats, Floats]) -> tuple[Finding, ...]:
     motion, _ = Motions(shared.scene, shared.integrator, q0, v0, shared.dt).under(shared.commands, increments=drawn)
     # The loop's check is for held controls.
     held = len(shared.commands.gains) and not shared.linear
-    gains = Gains(shared.commands.gains, shared.commands.reference, shared.integrator.variational)
+    gains = Gains(shared.commands.gains, shared.integrator.variational)
     loop = unstable_loop(shared.scene, motion, shared.commands.hold, gains) if held else ()
     return (*loop, *check(shared.scene, shared.integrator, motion, shared.commands if held else None).warnings)
 
@@ -237,7 +239,7 @@ class Paths(ABC):
 
     def executing(self, executor: Executor | None, workers: int | None) -> AbstractContextManager[Executor]:
         """The workers; one thread by default for functions in Python, which need not be thread-safe."""
-        python = self.shared.scene.noise.diffusion is None
+        python = bool(self.shared.scene.noise.own)
         return executing(executor, 1 if python and executor is None and workers is None else workers)
 
     def simulate(self, pool: Executor, progress: Callable[[int, int], None] | None = None) -> None:

@@ -82,7 +82,7 @@ class Ensemble(Printed, Frozen):
         warnings: One of each kind: errors, limits, paths that stopped early. The first path, the one with the most
             split steps, the one with the most energy and the fastest are checked as :func:`varpin.simulate` does.
         integrator: The integrator of all paths.
-        joint_names: Names of the coordinates; empty in files of 0.1.
+        joint_names: Names of the coordinates.
     """
 
     t: Annotated[Floats, Axes("nodes", finite=True)]

@@ -199,14 +199,14 @@ def identify(
             the search with the best values so far.
 
     Raises:
-        InputError: A name stands for no parameter, a log does not fit the scene or has a dead encoder, the scene has
-            constraints, or a value is out of its range.
+        InputError: A name stands for no parameter, a log does not fit the scene or tells no value (a dead encoder,
+            milliseconds, degrees), the scene has constraints, or a value is out of its range.
         UnknownJoint: A name is no joint of the robot.
     """
     refuse_constraints(require_scene(scene), "identify")
     of = parameters_of(scene, parameters)
-    given = (tuple_of("logs", logs, Log | Trajectory), tuple_of("held_out", held_out, Log | Trajectory))
-    matched, apart = ([as_log(each).matched(scene) for each in some] for some in given)
+    several = (tuple_of("logs", each, Log | Trajectory, "; varpin.Log.load reads files") for each in (logs, held_out))
+    matched, apart = ([as_log(each).matched(scene) for each in some] for some in several)
     if not matched:
         raise InputError("logs is empty: give one varpin.Log at least")
     for doubt in (doubt for log in (*matched, *apart) for doubt in log.warnings if doubt.kind in _NEVER):
@@ -276,7 +276,7 @@ def _made(fit: Fit, y: Floats, runs: Sequence[Run], apart: Sequence[Run], status
     )
     found = tuple(_doubts(fit, made, changes))
     announce(logger, of.scene.announced, fit.dt, found)
-    return made.changed(warnings=(*found, *(each for run in runs for each in run.log.warnings)))
+    return made.changed(warnings=(*(each for run in runs for each in run.log.warnings), *found))
 
 
 def _positions(run: Run, stretches: Sequence[Stretch], scene: Scene, late: float) -> Floats:

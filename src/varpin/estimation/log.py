@@ -220,7 +220,9 @@ def _doubts(scene: Scene, t: Floats, q: Floats, u: Floats) -> Iterator[Finding]:
         yield Finding("log beyond limits", text, names[far], value=float(beyond[far]), unit=unit)
     if turned := _opposite(scene, t, q, u):
         of = ", ".join(map(repr, turned))
-        text = f"u of {of} fits the motion far better with the opposite sign: turn it, or that of q where it is wrong"
+        text = (
+            f"u of {of} fits q far better with the opposite sign: turn u, q or the scene's gravity, whichever is wrong"
+        )
         yield Finding("sign of the controls", text)
     still, driven = most == least, (scene.actuation != 0.0) @ (np.ptp(u, axis=0) > 0.0)
     # An encoder that reads one number to the last bit while a control that changes acts on its joint.

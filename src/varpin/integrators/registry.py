@@ -35,9 +35,11 @@ def integrator_of(text: str) -> Integrator:
         InputError: The text has another form, the integrator or an option is unknown, or a value is out of its range.
     """
     try:
-        found = _value(ast.parse(text.strip(), mode="eval").body)
+        node = ast.parse(text.strip(), mode="eval").body
     except (SyntaxError, RecursionError, MemoryError):
-        found = None
+        node = None
+    head = node.func if isinstance(node, ast.Call) else node
+    found = _value(node) if node and isinstance(head, ast.Name) else None
     made = _made(found, [], {}) if isinstance(found, str) else found
     if not isinstance(made, Integrator):
         form = "a name, or a name with options such as Gauss(stages=3)"

@@ -237,7 +237,10 @@ class _Reader:
 
     def scalar(self, kind: Any, value: Any, name: str) -> Any:
         if issubclass(kind, Finding) and isinstance(value, str):
-            return kind.of_entry(value)
+            try:
+                return kind.of_entry(value)
+            except (TypeError, ValueError):
+                raise self.error(name, reprlib.repr(value), "a warning") from None
         if issubclass(kind, Enum) and value in kind.__members__:
             return kind[value]
         if kind is float and type(value) is int and abs(value) < 2**53:

@@ -19,6 +19,7 @@ from varpin.model.mimic import joint_index
 from varpin.model.robot import Robot, limits_of
 from varpin.model.sources import describe
 from varpin.model.tree import is_unbounded, joint_axis
+from varpin.model.units import ADVICE, typed_in_degrees
 from varpin.support.checks import (
     JointValues,
     as_floats,
@@ -268,8 +269,10 @@ def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
     require_finite(name, position)
     if kind.nv == 1:
         low, high, *_ = limits_of(model, joint)
-        if low < high and not low - _OUTSIDE <= position[0] <= high + _OUTSIDE:
-            unit = "m" if joint_axis(model, joint)[0] else "rad"
+        unit = "m" if joint_axis(model, joint)[0] else "rad"
+        if unit == "rad" and typed_in_degrees(position)[0]:
+            logger.warning("%s = %g looks like degrees: %s", name, position[0], ADVICE)
+        elif low < high and not low - _OUTSIDE <= position[0] <= high + _OUTSIDE:
             logger.warning("%s = %g is outside the joint's limits, %g to %g %s", name, position[0], low, high, unit)
     if kind.nv > 1:
         reference = pin.neutral(model)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 # Largest plausible angle [rad]: two turns.
 _TURNS = 4.0 * math.pi
-_ADVICE = "angles are in radians, np.deg2rad makes them of degrees"
+ADVICE = "angles are in radians, np.deg2rad makes them of degrees"
 
 # A joint whose limit is larger [rad or m] has none: exporters write 1e9, 1e16 or the largest double. Nobody types
 # larger angles in degrees.
@@ -63,7 +63,7 @@ def in_degrees(robot: Robot, name: str, values: Floats, *, speed: bool = False) 
     if not (wrong[joint] and abs(value) > _TURNS):
         return ()
     turns = f"{abs(value) / (2.0 * math.pi):.0f} turns{per}"
-    text = f"{name} of {name_of!r} is {value:.4g} rad{per}, {turns}, and looks like degrees: {_ADVICE}"
+    text = f"{name} of {name_of!r} is {value:.4g} rad{per}, {turns}, and looks like degrees: {ADVICE}"
     return (Finding("degrees", text, name_of, value=value, unit=f"rad{per}"),)
 
 

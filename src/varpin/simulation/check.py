@@ -323,9 +323,9 @@ def error_findings(
         right = int(np.flatnonzero((shares <= TOLD).all(axis=1))[-1])
         unit = joint_unit(scene.robot, joint)
         value = float(off[:last, joint].max())
-        part = f", {100.0 * share:.2g} % of the largest travel" if share < 1.0 else ""
+        part = f", {100.0 * share:.2g} % of the largest travel" if share < 0.99 else ""
         text = (
-            f"q is off by up to {value:.2g} {unit}{part} (joint {names[joint]!r}, wrong from t = {t[right]:.3g} s on). "
+            f"q is off by up to {value:.2g} {unit}{part} (joint {names[joint]!r}, wrong after t = {t[right]:.3g} s). "
         )
         if share <= _LINEAR:
             advice = cure(share / TOLD)
@@ -335,7 +335,7 @@ def error_findings(
             advice = cure(max(share / TOLD, growth))
             if drift[-1] > TOLD:
                 shorter = f"a shorter duration, as even rounding errors grow to {apart[-1, joint]:.2g} {unit}"
-                advice = f"Use {shorter}" if drift[right + 1] > TOLD else f"{advice}, or {shorter}"
+                advice = f"Use {shorter}" if drift[right + 1] > TOLD else f"{advice} and {shorter}"
             elif growth > _SENSITIVE:
                 advice += f", as deviations grow more than {_SENSITIVE:g}-fold"
         return (Finding("error", text + advice, names[joint], time=float(t[right]), value=value, unit=unit),)

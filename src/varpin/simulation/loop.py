@@ -3,9 +3,8 @@
 At some states of the motion the law is differentiated, :mod:`varpin.signals.responses`, unless its gains are known.
 With the plant's exact step under a zero-order hold, x' = A x + B u, the loop is unstable if the spectral radius of the
 step of (x_k, x_(k-1), ...) exceeds one (Franklin, Powell and Workman 1998, section 4.3). Growth that the law would have
-in continuous time too, as in a falling pendulum, gives no warning. A and B are those of the plant at rest: at the law's
-equilibrium, under gains where they follow, as if it were held there. The gains of plans made anew, or of a plan that
-moves on, are no law with an equilibrium of its own.
+in continuous time too, as in a falling pendulum, gives no warning. A and B are those of the plant at rest, at the law's
+equilibrium. The gains of plans made anew have none: there the plant is held at the state that the plan leads to.
 
 A law that does not respond to small displacements, as at its limits, shows by turning back every few periods.
 """
@@ -59,8 +58,11 @@ class Gains(NamedTuple):
     """Linear feedback: gains (P, m, 2n) or, with columns for the previous control, (P, m, 2n + m), of each period."""
 
     rows: Floats
-    reference: Floats  # (P, 2n) at least, that the state follows
     momentum: bool  # on (q, p), else on (q, v)
+    reference: Floats | None = None  # where each period leads (P, n) [rad or m]; None: to the feedback's equilibrium
+
+
+Response = tuple[int, Floats, Floats, Floats]  # a node, its control (m,), and ``H`` and ``kept`` of a loop
 
 
 @dataclass(frozen=True)
@@ -167,8 +169,18 @@ def _loops(
     if law is None or scene.inputs:
         return {}
     found: dict[int, Loop] = {}
+    # Oscillations by which controls alternate are at rest in the mean of three states.
+    centres = {k: 0.25 * (x[k - 1] + 2.0 * x[k] + x[k + 1]) for k in nodes}
+    given = _of_gains(scene, law, x, u, centres) if isinstance(law, Gains) else _of_law(scene, law, t, x, u, centres)
     try:
-        found.update(_of_gains(scene, law, nodes) if isinstance(law, Gains) else _of_law(scene, law, t, x, u, nodes))
+        for k, control, H, kept in given:
+            if not H.any() or not np.isfinite(H).all():
+                continue
+            if isinstance(law, Gains) and law.reference is not None:
+                q = nearest(scene, law.reference[k]) if scene.constraints else law.reference[k]
+                found[k], _ = _at_rest(scene, q, closest_controls(scene, q), H, kept)
+            elif loop := _at_equilibrium(scene, x[0, : scene.robot.dof], centres[k], control, H, kept):
+                found[k] = loop
     except (AssemblyError, SingularMassMatrix, ControlError, LinearizationError, np.linalg.LinAlgError) as error:
         logger.debug("a control law is differentiated at %d of %d states: %r", len(found), len(nodes), error)
     return found
@@ -213,40 +225,42 @@ def _by_turns(scene: Scene, x: Floats, u: Floats, t: Floats, control: int, turns
     return _finding(scene, control, text, float(len(turns)), float(t[turns[0]]))
 
 
-def _of_gains(scene: Scene, gains: Gains, nodes: Sequence[int]) -> Iterator[tuple[int, Loop]]:
-    """The loops with linear feedback at nodes, about the states that it follows."""
-    for k in nodes:
-        n = scene.robot.dof
-        q, (K, G) = gains.reference[k, :n], np.split(gains.rows[k], [2 * n], axis=1)
+def _of_gains(scene: Scene, gains: Gains, x: Floats, u: Floats, centres: dict[int, Floats]) -> Iterator[Response]:
+    """The response of linear feedback in the states around nodes, from its controls u (P, m) at x (P, 2n)."""
+    for k, state in centres.items():
+        n = len(state) // 2
+        K, G = np.split(gains.rows[k], [2 * n], axis=1)
         if gains.momentum:
-            K = np.concatenate([K[:, :n], K[:, n:] @ masses(scene, q[None])[0]], axis=1)
-        if K.any():
-            q = nearest(scene, q) if scene.constraints else q
-            kept = G if G.size else np.zeros((len(K), len(K)))
-            yield k, _at_rest(scene, q, closest_controls(scene, q), K[None], kept)[0]
+            K = np.concatenate([K[:, :n], K[:, n:] @ masses(scene, state[None, :n])[0]], axis=1)
+        control = u[k] + K @ (state - x[k])
+        if G.size:
+            yield k, control, np.array([np.linalg.matrix_power(G, i) @ K for i in range(MEMORY)]), G
+        else:
+            yield k, control, K[None], np.zeros((len(K), len(K)))
 
 
 def _of_law(
-    scene: Scene, law: Copies, t: Floats, x: Floats, u: Floats, nodes: Sequence[int]
-) -> Iterator[tuple[int, Loop]]:
-    """The loops with a law at nodes, about the equilibria that Newton's method finds from the motion's start.
-
-    Each is that of a law with the control and the responses of the node everywhere.
-    """
-    n = scene.robot.dof
-    # Oscillations by which controls alternate are at rest in the mean of three states.
-    centres = {k: 0.25 * (x[k - 1] + 2.0 * x[k] + x[k + 1]) for k in nodes}
+    scene: Scene, law: Copies, t: Floats, x: Floats, u: Floats, centres: dict[int, Floats]
+) -> Iterator[Response]:
+    """The response of a law at nodes, by its differences; what follows is a multiple of what it remembers."""
     for k, control, H in responses(scene, law, t, x, u, centres):
-        q, K, kept = x[0, :n], H.sum(axis=0), np.zeros((len(control), len(control)))
-        if len(H) == MEMORY:
-            kept = np.clip(np.vdot(H[-1], H[-2]) / np.vdot(H[-2], H[-2]), 0.0, 1.0) * np.eye(len(control))
-        for _ in range(_ITERATIONS if H.any() and np.isfinite(H).all() else 0):
-            q = nearest(scene, q) if scene.constraints else q
-            loop, way = _at_rest(scene, q, control + K @ (np.append(q, np.zeros(n)) - centres[k]), H, kept)
-            if np.abs(way).max() < _CONVERGED:
-                yield k, loop
-                break
-            q = q + way / max(1.0, np.abs(way).max())
+        ratio = np.vdot(H[-1], H[-2]) / np.vdot(H[-2], H[-2]) if len(H) == MEMORY else 0.0
+        yield k, control, H, np.clip(ratio, 0.0, 1.0) * np.eye(len(control))
+
+
+def _at_equilibrium(scene: Scene, start: Floats, centre: Floats, u: Floats, H: Floats, kept: Floats) -> Loop | None:
+    """The loop at the equilibrium that Newton's method finds from ``start`` (n,), None if it finds none.
+
+    The law has the control u (m,) at the state ``centre`` (2n,) and the responses H (J, m, 2n) everywhere.
+    """
+    q, K = start, H.sum(axis=0)
+    for _ in range(_ITERATIONS):
+        q = nearest(scene, q) if scene.constraints else q
+        loop, way = _at_rest(scene, q, u + K @ (np.append(q, np.zeros_like(q)) - centre), H, kept)
+        if np.abs(way).max() < _CONVERGED:
+            return loop
+        q = q + way / max(1.0, np.abs(way).max())
+    return None
 
 
 def _at_rest(scene: Scene, q: Floats, u: Floats, H: Floats, kept: Floats) -> tuple[Loop, Floats]:

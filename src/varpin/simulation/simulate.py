@@ -100,7 +100,7 @@ def simulate(
         check: Find the error of the motion, ``Trajectory.error``, and what is doubtful, ``Trajectory.warnings``. Where
             the record alone shows the motion right the check takes half of the motion's time; else, and under a control
             law, of which it calls a copy, it repeats the motion by a method of two stages more, with forces and stiff
-            methods in half steps, which takes two to five times as long as the motion.
+            methods in half steps, which takes two to five times as long as the motion, or twice that.
         progress: Called now and then with (steps done, steps in all). A function with three required arguments, such
             as :class:`varpin.LiveView`, also gets a :class:`varpin.Nodes` with the nodes since the last call, whose
             last node comes first again.
@@ -183,7 +183,7 @@ def simulate(
     held = commands.hold > 1 and not law
     record = MotionRecord(scene, integrator, dt, dw, start, commands if linear else None, held=held)
     kept = copier(controls) if check and callable(controls) else None
-    fed = kept if law else Gains(commands.gains, commands.reference, integrator.variational)
+    fed = kept if law else Gains(commands.gains, integrator.variational)
     loop = functools.partial(unstable_loop, scene, hold=hold, law=fed) if check and hold else None
     interrupted = not _roll(record, state, steps, controls, commands, Reporter(progress, steps, dt), loop)
     motion = record.trajectory()

@@ -40,6 +40,9 @@ class Frozen:
         vars(copy).update(Frozen.__getstate__(self) | values)
         return copy
 
+    def __copy__(self) -> Self:
+        return self.changed()
+
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name not in self._cached}
 

@@ -93,9 +93,9 @@ class BoundConstraint(Frozen, ABC):
         Where controls are linear between nodes, u (..., N + 1, m) are those at the nodes.
         """
 
-    def of_states(self, q: Floats, v: Floats) -> Floats:
-        """:meth:`value` of a constraint of states, in which controls have no part."""
-        return self.value(q, v, np.zeros((*q.shape[:-1], 0)))
+    def of_states(self, q: Floats, v: Floats, controls: int) -> Floats:
+        """:meth:`value` of a constraint of states, in which the m = ``controls`` have no part."""
+        return self.value(q, v, np.zeros((*q.shape[:-1], controls)))
 
     def jacobian(self, q: Floats, v: Floats) -> Floats:
         """dc/d(q, v) (K, rows, 2n) of one motion, q and v (N + 1, n).
