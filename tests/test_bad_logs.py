@@ -46,7 +46,7 @@ def test_what_no_value_could_be_right_from_is_refused(what):
 
 WARNED = {
     "a clock that is fast by 1 %": (lambda t, q, u: (1.01 * t, q, u), ("clock", "q_noise")),
-    "an encoder with its sign turned": (
+    "an encoder of the other sign": (
         lambda t, q, u: (t, q * [1, 1, -1, 1, 1, 1], u),
         ("'elbow_joint'", "opposite sign"),
     ),
