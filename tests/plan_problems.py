@@ -214,6 +214,7 @@ SMALL = {
     "linear, rates and goal": row(208.02676, GOAL, vp.WithinControlRate(120.0), **LINES),
     "linear, change of controls": row(4.2462364, more=CHANGES, **LINES, **LIMITS),
     "linear, speeds": row(3.5263477, speeds(1.8), within=3.6e-3, **LINES),
+    "linear, between nodes": row(3.533591, speeds(1.8), within=3.6e-4, **BETWEEN, **LINES),
     "linear, speeds and torques": row(9.1274867, speeds(2.2), within=4.4e-3, **LINES, **LIMITS),
     "linear, joints": row(3.6565019, JOINTS, within=1e-3, **LINES),
     "linear, out of a sphere": row(31.86263, SPHERE, within=1e-3, **LINES),
