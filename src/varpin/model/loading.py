@@ -269,10 +269,10 @@ def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
     require_finite(name, position)
     if kind.nv == 1:
         low, high, *_ = limits_of(model, joint)
-        unit = "m" if joint_axis(model, joint)[0] else "rad"
-        if unit == "rad" and typed_in_degrees(position)[0]:
+        if not kind.shortname().startswith("JointModelP") and typed_in_degrees(position)[0]:
             logger.warning("%s = %g looks like degrees: %s", name, position[0], ADVICE)
         elif low < high and not low - _OUTSIDE <= position[0] <= high + _OUTSIDE:
+            unit = "m" if joint_axis(model, joint)[0] else "rad"
             logger.warning("%s = %g is outside the joint's limits, %g to %g %s", name, position[0], low, high, unit)
     if kind.nv > 1:
         reference = pin.neutral(model)
