@@ -21,7 +21,7 @@ from varpin.finding import Finding
 from varpin.mechanics.wiener import children
 from varpin.signals.controls import commands_of
 from varpin.signals.policy import LinearPolicy
-from varpin.support.markup import Printed, warning_count
+from varpin.support.markup import Printed, warning_count, warning_lines
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class MonteCarlo(Printed):
             f"difference: {gap:+.6e} ({percent(excess(self.cost, self.predicted))}{apart})",
             "how to read it: within three standard errors the two agree; beyond, noise is too strong for the model",
         ]
-        return "\n".join([*lines, *map(str, self.broken), *(f"warning: {warning}" for warning in self.warnings)])
+        return "\n".join([*lines, *map(str, self.broken), *warning_lines(self.warnings)])
 
 
 class Found(NamedTuple):

@@ -39,7 +39,7 @@ from varpin.simulation.record import Progress
 from varpin.simulation.simulate import noise_forgotten, simulate
 from varpin.support.checks import JointValues, control_values, count, positive, real, told_motion
 from varpin.support.frozen import Frozen
-from varpin.support.markup import Printed, facts, warning_count
+from varpin.support.markup import Printed, facts, warning_count, warning_lines
 from varpin.support.one_thread import one_thread
 from varpin.trajectory import Nodes, Trajectory
 
@@ -142,8 +142,7 @@ class MpcRun(Printed, Frozen):
         return f"MpcRun({text}{warning_count(self.warnings)})"
 
     def __str__(self) -> str:
-        warned = (f"warning: {sentence}" for sentence in self.warnings)
-        return "\n".join([repr(self), *map(str, self.constraints), *warned])
+        return "\n".join([repr(self), *map(str, self.constraints), *warning_lines(self.warnings)])
 
 
 @dataclass(frozen=True)

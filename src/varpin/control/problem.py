@@ -267,7 +267,8 @@ class OptimalControlProblem(Frozen):
 
     def begun(self, u: Floats) -> Floats:
         """Controls of decisions (R, m) whose first one is :attr:`begin` where that is given."""
-        return np.vstack([np.where(np.isnan(self.begin), u[0], self.begin), u[1:]])
+        given = self.begin
+        return np.vstack([np.where(np.isnan(given), u[0], given), u[1:]])
 
     @property
     def decisions(self) -> int:

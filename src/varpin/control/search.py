@@ -309,7 +309,8 @@ class Search:
         problem, along, rows = self.problem, self.along, self.rows
         u, (lower, upper) = problem.decided(self.trajectory), problem.control_limits
         least, most = np.minimum(lower - u, 0.0), np.maximum(upper - u, 0.0)
-        least[0], most[0] = (np.where(np.isnan(problem.begin), part[0], 0.0) for part in (least, most))
+        free = np.isnan(problem.begin)
+        least[0], most[0] = (np.where(free, part[0], 0.0) for part in (least, most))
         program = Program(along, rows, (least, most), plan, self.regularization if rows else 0.0)
         self.program = program
         values, bad = self._values, self._badness

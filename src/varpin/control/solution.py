@@ -29,7 +29,7 @@ from varpin.linearization import velocity_at_nodes
 from varpin.signals.policy import LinearPolicy
 from varpin.support.checks import JointValues, count, flag, path_like, positive, word
 from varpin.support.frozen import Frozen
-from varpin.support.markup import facts, folded, listed, table, warning_count
+from varpin.support.markup import facts, folded, listed, table, warning_count, warning_lines
 from varpin.trajectory import PLAN_FORMAT, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -128,9 +128,7 @@ class Solution(Frozen):
 
     def __str__(self) -> str:
         told = [] if self.status.converged or not self.reason else [f"why: {self.reason}"]
-        return "\n".join(
-            [repr(self), *told, *map(str, self.constraints), *(f"warning: {sentence}" for sentence in self.warnings)]
-        )
+        return "\n".join([repr(self), *told, *map(str, self.constraints), *warning_lines(self.warnings)])
 
     def _repr_html_(self) -> str:
         problem = self.problem
@@ -151,10 +149,9 @@ class Solution(Frozen):
 
     def table(self) -> str:
         """The iterations, one row each, and how and why they ended; :class:`Solution` explains the columns."""
-        warned = (f"warning: {sentence}" for sentence in self.warnings)
         refined = [] if self.refinement is None else str(self.refinement).splitlines()
-        rows = [*map(str, self.history), *map(str, self.constraints), *refined]
-        return "\n".join([Iteration.HEADER, *rows, *warned, self.status.value, f"({self.reason})"])
+        rows = [*map(str, self.history), *map(str, self.constraints), *refined, *warning_lines(self.warnings)]
+        return "\n".join([Iteration.HEADER, *rows, self.status.value, f"({self.reason})"])
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the solution as a compressed npz file without pickle; returns its path.

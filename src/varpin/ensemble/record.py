@@ -15,7 +15,7 @@ from varpin.finding import Finding
 from varpin.io.archive import Axes, read_npz, record_of, save_npz
 from varpin.support.checks import path_like
 from varpin.support.frozen import Frozen
-from varpin.support.markup import Printed, joint_table, warning_count
+from varpin.support.markup import Printed, joint_table, warning_count, warning_lines
 
 FORMAT = "varpin.ensemble/1"
 
@@ -127,7 +127,7 @@ class Ensemble(Printed, Frozen):
     def __str__(self) -> str:
         own = self.statistics
         energy = f"energy [J]: {own.energy_mean[-1]:.4g} +- {own.energy_deviation[-1]:.2g} in the end"
-        return "\n".join([repr(self), energy, *(f"warning: {warning}" for warning in self.warnings)])
+        return "\n".join([repr(self), energy, *warning_lines(self.warnings)])
 
     def _repr_html_(self) -> str:
         mean, deviation = self.statistics.mean[-1], np.sqrt(np.diagonal(self.statistics.covariance[-1]))

@@ -28,7 +28,7 @@ from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
 from varpin.simulation.choice import given_integrator, usual_integrator
 from varpin.support.checks import JointValues, finite_array, joint_array, positive
 from varpin.support.frozen import Frozen
-from varpin.support.markup import warning_count
+from varpin.support.markup import warning_count, warning_lines
 from varpin.trajectory import Trajectory
 
 # Standard deviations of a start that is not given, in units of those of the first two samples: it then counts for 1e-4
@@ -83,7 +83,7 @@ class Estimate(Frozen):
         return f"Estimate({len(self.t)} samples, {n} joints, {what} by {self.integrator}{warning_count(self.warnings)})"
 
     def __str__(self) -> str:
-        return "\n".join([repr(self), *(f"warning: {warning}" for warning in self.warnings)])
+        return "\n".join([repr(self), *warning_lines(self.warnings)])
 
     @property
     def innovations(self) -> Floats:

@@ -18,7 +18,7 @@ from scipy.linalg import qr
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
-from varpin.estimation.filter import measurements, misfit
+from varpin.estimation.filter import misfit, variances
 from varpin.estimation.fit import LATEST, LOST, Fit, Run, Stretch, predictions, simulations
 from varpin.estimation.grid import Grid
 from varpin.estimation.log import Log, as_log
@@ -31,7 +31,7 @@ from varpin.model.urdf_output import save_urdf
 from varpin.simulation.choice import given_integrator
 from varpin.support.checks import JointValues, count, finite, positive, real, tuple_of
 from varpin.support.frozen import Frozen
-from varpin.support.markup import warning_count
+from varpin.support.markup import warning_count, warning_lines
 from varpin.support.tables import Table
 from varpin.trajectory import Trajectory
 
@@ -100,8 +100,7 @@ class Identification(Frozen):
         return f"Identification({len(self.names)} parameters{payloads}, {len(self.logs)} logs, {self.status}{warned})"
 
     def __str__(self) -> str:
-        told = [f"warning: {warning}" for warning in self.warnings]
-        return "\n".join([repr(self), *(f"\n{part}" for part in self.tables), *told])
+        return "\n".join([repr(self), *(f"\n{part}" for part in self.tables), *warning_lines(self.warnings)])
 
     @property
     def tables(self) -> tuple[Table, ...]:
@@ -383,9 +382,7 @@ def _misfit(fit: Fit, made: Identification) -> Iterator[Finding]:
     if fit.of.scene.processes:
         yield from misfit(fit.cost, len(fit.jacobian))
         return
-    squares = (
-        np.square(np.concatenate(made.residuals)) / measurements(made.logs[0], *fit.noise)[1][: made.scene.robot.dof]
-    )
+    squares = np.square(np.concatenate(made.residuals)) / variances("q_noise", fit.q_noise, fit.noise[0])
     there = np.isfinite(squares)
     by_joint = np.sqrt(np.where(there, squares, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1))
     worst = int(np.argmax(by_joint))

@@ -242,7 +242,7 @@ def _opposite(scene: Scene, t: Floats, q: Floats, u: Floats) -> list[str]:
     at = rows[: len(rows) // k * k].reshape(-1, k)
     s = t[at] - t[at].mean(axis=1, keepdims=True)
     parabolas = np.linalg.pinv(np.stack([np.ones_like(s), s, 0.5 * s**2], axis=2)) @ q[at]
-    place, v, a = (np.ascontiguousarray(parabolas[:, j]) for j in range(3))
+    place, v, a = parabolas.swapaxes(0, 1)
     needed, force = inverse_dynamics(scene.core, place, v, a), u[at].mean(axis=1) @ scene.actuation.T
     # Friction and dampers that the scene does not have, of any size, tell nothing.
     passive = np.linalg.qr(np.array([np.sign(v), v]).T)[0]

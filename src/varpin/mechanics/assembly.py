@@ -99,7 +99,7 @@ def missed(scene: Scene, q: Floats) -> tuple[str, float]:
 
 def _values(scene: Scene, q: Floats) -> tuple[Floats, Floats]:
     """Residuals g (c,) and Jacobian C (c, n); rows of kinematic inputs, which hold at any q, are zero."""
-    g, _, C = scene.core.constraints(np.ascontiguousarray(q[None]))
+    g, _, C = scene.core.constraints(q[None])
     g[:, list(scene.inputs)], C[:, list(scene.inputs)] = 0.0, 0.0
     return g[0], C[0]
 

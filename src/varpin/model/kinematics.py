@@ -92,9 +92,14 @@ def frame_kinematics(robot: Robot, frame: str) -> FrameKinematics:
     return FrameKinematics(frame, links(robot.tree, body), rotation, translation)
 
 
-def logarithms(R: Floats) -> tuple[Floats, Floats]:
-    """Rotation vectors (N, 3) of rotations (N, 3, 3), and derivatives (N, 3, 3) over turns of the rotated body."""
-    return np.array([pin.log3(turn) for turn in R]), np.array([pin.Jlog3(turn) for turn in R])
+def rotation_vectors(R: Floats) -> Floats:
+    """Rotation vectors (N, 3) of rotations (N, 3, 3)."""
+    return np.array([pin.log3(turn) for turn in R])
+
+
+def rotation_vector_slopes(R: Floats) -> Floats:
+    """Derivatives (N, 3, 3) of :func:`rotation_vectors` over turns of the rotated body."""
+    return np.array([pin.Jlog3(turn) for turn in R])
 
 
 def mass_carriers(robot: Robot) -> Links:

@@ -150,7 +150,7 @@ class RobotReport(Frozen):
         return f"RobotReport({self.robot.name}: {len(self.joints)} joints, {len(self.links)} links{warned})"
 
     def __str__(self) -> str:
-        told = [f"warning: {warning}" for warning in self.warnings] or ["nothing looks wrong"]
+        told = markup.warning_lines(self.warnings) or ["nothing looks wrong"]
         return "\n".join([*(f"{table}\n" for table in self.tables), *told])
 
     @property

@@ -274,7 +274,7 @@ def _at_rest(scene: Scene, q: Floats, u: Floats, H: Floats, kept: Floats) -> tup
     a, *_ = accelerations(scene, q[None], still, force)
     _, aq, av, af = (part[0] for part in accelerations(scene, q[None], still, force - a @ M))
     if scene.constraints:
-        C = scene.core.constraints(np.ascontiguousarray(q[None]))[2][0]
+        C = scene.core.constraints(q[None])[2][0]
         lam = np.linalg.lstsq(C @ af @ C.T, -C @ a[0], rcond=_RANK)[0]
         aq = aq + af @ scene.core.constraint_curvature(q, lam, q)[0]
     onto = np.linalg.solve(Z.T @ M @ Z, Z.T @ M)

@@ -56,7 +56,7 @@ def _covariances(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     M, D = masses(scene, q), damping_matrices(scene, q, v, trajectory.u[at] @ scene.actuation.T, custom=True)
     one = free = np.eye(q.shape[1])
     if scene.constraints:
-        C = scene.core.constraints(np.ascontiguousarray(q))[2]
+        C = scene.core.constraints(q)[2]
         free = one - np.linalg.pinv(C) @ C
     # What constraints hold has a unit mass, no damper and no noise.
     root = np.linalg.cholesky(free @ M @ free + one - free)

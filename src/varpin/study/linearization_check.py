@@ -120,7 +120,7 @@ def check_linearization(
     Z = np.eye(n)
     if scene.constraints:
         # The velocities that constraints allow, with kinematic inputs at will.
-        C = scene.core.constraints(np.ascontiguousarray(q[None]))[2][0]
+        C = scene.core.constraints(q[None])[2][0]
         Z = null_space(np.delete(C, list(scene.inputs), axis=0), rcond=_RANK)
 
     def ends(at: Floats, velocity: Floats, control: Floats, dw: Floats) -> Floats:

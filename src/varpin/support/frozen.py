@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copyreg
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, ClassVar, Self
@@ -10,12 +9,8 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 
-def _view(values: dict[Any, Any]) -> MappingProxyType[Any, Any]:
-    return MappingProxyType(values)
-
-
-# Views of mappings, which Python does not pickle, are pickled as mappings.
-copyreg.pickle(MappingProxyType, lambda view: (_view, (dict(view),)))
+class _View(dict[str, Any]):
+    """A view of a mapping, which Python does not pickle, on its way."""
 
 
 class Frozen:
@@ -37,27 +32,31 @@ class Frozen:
         """A copy with other values of attributes, which are not checked; cached properties are computed anew."""
         copy = object.__new__(type(self))
         # The frozen dataclass refuses assignments.
-        vars(copy).update(Frozen.__getstate__(self) | values)
+        vars(copy).update(self._kept() | values)
         return copy
 
     def __copy__(self) -> Self:
         return self.changed()
 
-    def __getstate__(self) -> dict[str, Any]:
+    def _kept(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name not in self._cached}
+
+    def __getstate__(self) -> dict[str, Any]:
+        kept = self._kept().items()
+        return {name: _View(value) if isinstance(value, MappingProxyType) else value for name, value in kept}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update({name: _read_only(value) for name, value in state.items()})
 
 
 def _read_only(value: Any) -> Any:
-    """An array, or those of a tuple or a view of a mapping, read-only."""
+    """An array, or those of a tuple or a view of a mapping, read-only, and the view as it was."""
     if isinstance(value, np.ndarray):
         # A buffer of another owner may be unaligned.
         array = value if value.flags.owndata and value.flags.aligned else value.copy(order="K")
         array.setflags(write=False)
         return array
-    if isinstance(value, MappingProxyType):
+    if isinstance(value, _View):
         return MappingProxyType({name: _read_only(item) for name, item in value.items()})
     if isinstance(value, tuple):
         items = map(_read_only, value)

@@ -73,3 +73,8 @@ def _text(value: object) -> str:
 def warning_count(warnings: Sequence[str]) -> str:
     """The number of warnings as a part of a line; empty if there are none."""
     return f", {len(warnings)} warning{'s' * (len(warnings) > 1)}" if warnings else ""
+
+
+def warning_lines(warnings: Iterable[str]) -> list[str]:
+    """Warnings as lines of a text."""
+    return [f"warning: {warning}" for warning in warnings]

@@ -13,7 +13,7 @@ from varpin.arrays import Floats
 from varpin.control.constraints.base import OfStates, finite_sides
 from varpin.errors import InputError
 from varpin.model import Robot
-from varpin.model.kinematics import frame_kinematics, logarithms
+from varpin.model.kinematics import frame_kinematics, rotation_vector_slopes, rotation_vectors
 from varpin.support.checks import finite, finite_array, named_limits, over_time, positive, rotation_matrix
 
 _XYZ = ("x", "y", "z")
@@ -65,14 +65,14 @@ class ReachFrame(_OfFrame):
     def values(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
         R, p = self.kinematics.placements(q)
         found = [] if self.position is None else [p - self.position]
-        found += [] if self.rotation is None else [logarithms(self.rotation.T @ R)[0]]
+        found += [] if self.rotation is None else [rotation_vectors(self.rotation.T @ R)]
         return np.concatenate(found, axis=1)
 
     def slopes(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
         R, _, J = self.kinematics.jacobians(q)
         found = [] if self.position is None else [J[:, :3]]
         if self.rotation is not None:
-            of_body = logarithms(self.rotation.T @ R)[1] @ np.swapaxes(R, 1, 2)
+            of_body = rotation_vector_slopes(self.rotation.T @ R) @ np.swapaxes(R, 1, 2)
             found.append(of_body @ J[:, 3:])
         return np.concatenate(found, axis=1)
 
