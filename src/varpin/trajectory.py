@@ -393,7 +393,8 @@ class Trajectory(Frozen):
         if found.joint_names != robot.joint_names:
             raise FileError(
                 f"{source} is of robot {found.robot} with joints {', '.join(found.joint_names)}; "
-                f"{robot.name!r} has joints {', '.join(robot.joint_names)}"
+                f"{robot.name!r} has joints {', '.join(robot.joint_names)}: give its own robot, for varpin replay as "
+                "--robot"
             )
         masses = robot.tree.mass
         if found.masses.shape != masses.shape or not np.allclose(found.masses, masses, rtol=1e-6):

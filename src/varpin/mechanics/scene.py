@@ -224,7 +224,7 @@ class Scene(Frozen):
         Raises:
             InputError: The scene has constraints, a CustomForce or CustomNoise, which are of all joints.
             UnknownJoint: There is no such joint.
-            RobotError: No joint is left.
+            RobotError: No joint is left of a robot; of :func:`combine`'s, leave the robot itself out.
         """
         from varpin.mechanics.reduction import without  # noqa: PLC0415 - it is made of scenes
 
@@ -241,7 +241,8 @@ class Scene(Frozen):
         """The joints that have to be computed, and those that stay at rest: ``scene.without(required.idle)``.
 
         A group of joints that shares no inertia with others is idle if it starts at rest, and no gravity, spring, noise
-        or control acts on it, nor a task. The motion of the other joints is the same without it.
+        or control acts on it, nor a task. The motion of the other joints is the same without it. A robot whose joints are
+        all idle keeps them: it has no motion without any.
 
         Args:
             q0: Initial configuration, (n,) or by joint name [rad or m].

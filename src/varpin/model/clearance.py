@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
@@ -308,7 +308,7 @@ def clearance(
             raise InputError(f"capsules[{name!r}] must be (begin, end, radius), got {capsule!r}")
     if links is not None and len(set(links)) < len(links):
         raise InputError(f"links has a name twice: {', '.join(map(str, links))}")
-    fitted = {} if links is not None and set(links) <= set(given) else _vertices(robot)
+    fitted = {} if links is not None and set(links) <= set(given) else _vertices(robot, links, given)
     names = list(dict.fromkeys([*fitted, *given])) if links is None else list(links)
     joints = [_joint(robot, name) for name in names]
     bodies = []
@@ -358,12 +358,16 @@ def _disabled(robot: Robot, srdf: Path | None) -> set[frozenset[str]]:
     return pairs
 
 
-def _vertices(robot: Robot) -> dict[str, Floats]:
-    """Points (N, 3) [m], in each link's axes, whose hull contains the shapes of the link."""
+def _vertices(robot: Robot, links: Sequence[str] | None, given: Collection[str]) -> dict[str, Floats]:
+    """Points (N, 3) [m], in each link's axes, whose hull contains the shapes of the link.
+
+    Those of ``links``, or of all if None, must be readable, but for links with a given capsule.
+    """
     found: dict[str, list[Floats]] = {}
     shapes, faulty = readable_geometry(robot)
-    for _, what in faulty.values():
-        raise RobotError(what)
+    for name, (_, what) in faulty.items():
+        if (links is None or name in links) and name not in given:
+            raise RobotError(f"{what}; give capsules={{{name!r}: (begin, end, radius)}}, or links= without it")
     for shape in shapes.geometryObjects:
         frame = robot.model.frames[shape.parentFrame]
         place = frame.placement.inverse()

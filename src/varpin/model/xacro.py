@@ -68,7 +68,7 @@ def expand(packages: Packages, arguments: Mapping[str, object], *, strict: bool 
             if found := _UNDEFINED.search(str(error)):
                 raise RobotError(
                     f"{path} needs the xacro argument {found[1]!r}, which has no default: "
-                    f"give xacro_args={{{found[1]!r}: ...}}"
+                    f"give xacro_args={{{found[1]!r}: ...}}, or on the command line --xacro-args {found[1]}=..."
                 ) from None
             before = len(notes.getvalue())
             xacro.print_location()
