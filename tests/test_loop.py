@@ -77,7 +77,7 @@ def test_jury_conditions(kp, kd, period):
     for finding in told(motion):
         assert (finding.kind, finding.joint) == (KIND, "joint1")
         np.testing.assert_allclose(finding.value, size, rtol=1e-6)
-        assert naming([finding], f"{size:.4g}", "0.01 s")
+        assert naming([finding], f"{size:.6g}", "0.01 s")
         # The period that is stable, at most a tenth short.
         limit = min(2.0 * INERTIA / kd, 2.0 * kd / max(kp, 1e-9))
         shorter = float(finding.split("below ")[1].split(" s")[0])
@@ -140,7 +140,7 @@ def test_a_law_is_read_off_where_it_does_not_clip():
     size = radius(scene, np.array([[-kp, -kd]]), 2 * 5.33e-3, np.ones(1))
     motion = run(scene, [1.0003], [0.0], pd(kp, kd, limit=20.0), dt=5.33e-3, steps=600, period=2)
     assert (np.abs(motion.u[::2]) < 20.0).sum() < 10
-    assert naming(told(motion), f"{size:.4g}")
+    assert naming(told(motion), f"{size:.6g}")
 
 
 @pytest.mark.parametrize(
@@ -377,7 +377,7 @@ def test_a_policy_on_the_control_before(kd, kept):
 def test_the_sentence(caplog):
     with caplog.at_level(logging.WARNING, "varpin"):
         (sentence,) = run(ROD, [0], [0], pd(1e4, 200.0), dt=5e-3, steps=50).warnings
-    assert naming([sentence], "unstable", "0.005 s", "2.136", "lower gains")
+    assert naming([sentence], "unstable", "0.005 s", "2.13583", "lower gains")
     assert len(sentence) <= 240
     assert [record.getMessage() for record in caplog.records] == [sentence]
     assert not run(ROD, [0], [0], pd(1e4, 200.0), dt=5e-3, steps=50, check=False).warnings

@@ -125,9 +125,9 @@ def unstable_loop(
     t, u, x = trajectory.t[at], trajectory.u[at], np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1)
     if len(at) < 3 or not np.ptp(u, axis=0).any():
         return ()
-    worst, turning = _turning(u)
-    groups = [_spread(nodes) for nodes in (_inside(u), turning)]
     with np.errstate(all="ignore"), one_thread():
+        worst, turning = _turning(u)
+        groups = [_spread(nodes) for nodes in (_inside(u), turning)]
         loops = _loops(scene, law, t, x, u, sorted(set().union(*groups)))
         for nodes in groups:
             found = _by_theory(scene, [loops[k] for k in nodes if k in loops], period)
@@ -207,7 +207,7 @@ def _by_theory(scene: Scene, loops: Sequence[Loop], period: float) -> tuple[Find
     stable = next((float(T) for T in period * _SHORTER ** np.arange(1, 60) if loop.mode(T)[0] <= 1.0 + _GROWTH), None)
     advice = "lower gains" if stable is None else f"a period below {stable:.3g} s, or lower gains"
     text = (
-        f"control loop is unstable at its period of {period:.4g} s: each period multiplies deviations by {radius:.4g}. "
+        f"control loop is unstable at its period of {period:.4g} s: each period multiplies deviations by {radius:.6g}. "
         f"Use {advice}"
     )
     return _finding(scene, int(np.argmax(sizes)), text, radius)
