@@ -302,10 +302,11 @@ def test_a_loop_that_keeps_what_begins_together_together_is_not_told_of():
 
 @pytest.mark.parametrize(("rotors", "unstable"), [(0.05, False), (0.3, True)])
 @pytest.mark.parametrize("noise", [0.0, 0.01])
-def test_gains_that_are_too_high_for_the_plant_are_told_of(rotors, unstable, noise):
+@pytest.mark.parametrize("controls", ["held", "linear"])
+def test_gains_that_are_too_high_for_the_plant_are_told_of(rotors, unstable, noise, controls):
     """Plans are for rotors [kg m^2] that the plant has not, and of too many all runs away."""
     q0 = np.array([0.3, -1.2, 1.2, -0.5, -1.0, 0.2])
-    problem = reach(vp.load_robot("ur5", armature=rotors), q0, q0 + 0.1, dt=0.01, steps=20)
+    problem = reach(vp.load_robot("ur5", armature=rotors), q0, q0 + 0.1, dt=0.01, steps=20, controls=controls)
     plant = vp.Scene(vp.load_robot("ur5"), damping=1.0, noise=vp.AdditiveNoise(noise))
     run = vp.Mpc(problem, iterations=1).run(vp.Plant(plant, substeps=5), duration=0.12, rng=1)
     assert (np.abs(run.motion.v).max() > 100.0) == unstable

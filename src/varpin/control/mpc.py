@@ -160,6 +160,8 @@ class Mpc:
     nodes, and in the middles of steps with ``between_nodes`` or linear controls. A goal (:class:`ReachFrame`) applies
     to the end of every horizon. The size of a margin is that of the first plan.
 
+    An ``unstable loop`` is told of by the feedback of most plans, not where plans jump from tick to tick.
+
     Main args:
         problem: The problem. Its horizon, discretization, noise, limits and constraints apply to every tick, its
             initial state and ``t0`` to the first.
@@ -356,8 +358,6 @@ class _Loop:
         if plan.status is Status.INTERRUPTED or any(told.kind == "interrupted" for told in plan.warnings):
             raise KeyboardInterrupt
         self.applied = self.problem.before
-        self.feedback: list[Floats] = []  # gains of each tick on (q, v), and what they follow
-        self.reference: list[Floats] = []
         self.nodes: list[tuple[float, Floats, Floats]] = []  # of the tick so far
         self.rows = np.zeros((0, plant.scene.controls))  # controls of its steps
 
@@ -409,8 +409,6 @@ class _Loop:
         ended = age >= _lines(plan)
         policy = plan.shifted(plan.problem.decisions - 1, x="velocity") if ended else plan.policy_on("velocity")
         row = 0 if ended else age
-        self.feedback.append(policy.feedback[row])
-        self.reference.append(policy.reference[row, : len(q)])
         self.applied = policy.control(row, np.concatenate([q, v]), before)
         for bound in plan.problem.bound_constraints:
             if isinstance(bound, BoundRate) and before is not None:
@@ -428,10 +426,10 @@ class _Loop:
         return motion.changed(warnings=(*self.unstable(motion), *limits, *self.without_plans()))
 
     def unstable(self, motion: Trajectory) -> tuple[Finding, ...]:
-        """The warning of a loop that is unstable at its period, under the feedback of each tick if it is held."""
-        held = not self.problem.linear
-        gains = Gains(np.array(self.feedback), momentum=False, reference=np.array(self.reference)) if held else None
-        return unstable_loop(self.plant.scene, motion, self.plant.substeps, gains)
+        """The warning of a loop that is unstable at its period, under the feedback of each tick."""
+        rows, reference = map(np.array, zip(*map(_feedback, self.ticks), strict=True))
+        planned = self.problem.scene if self.problem.integrator.variational else None
+        return unstable_loop(self.plant.scene, motion, self.plant.substeps, Gains(rows, planned, reference))
 
     def without_plans(self) -> Iterator[Finding]:
         """Warnings if more than a few plans took longer than the budget or the period, or searches found no plan."""
@@ -511,6 +509,20 @@ def _require_fit(plant: Scene, planned: Scene) -> None:
 def _lines(plan: Solution) -> int:
     """How many ticks a plan lasts."""
     return plan.problem.decisions - plan.problem.linear
+
+
+def _feedback(tick: _Tick) -> tuple[Floats, Floats]:
+    """The gains of a tick, (m, 2n) or (m, 2n + m), and the configuration (n,) that they are about.
+
+    Those of a line are of its mean, to whose two ends a fresh plan reacts. Lines of older plans count as none.
+    """
+    plan, age, *_ = tick
+    policy, row = plan.policy, min(age, _lines(plan) - 1)
+    gains, begin = policy.feedback[row], plan.gains[0]
+    if policy.linear:
+        end, kept = np.split(policy.feedback[0], [begin.shape[1]], axis=1)
+        gains = 0.5 * (age == 0) * (begin + end + kept @ begin)
+    return gains, policy.reference[row, : plan.problem.scene.robot.dof]
 
 
 def _margins(problem: OptimalControlProblem, previous: Solution, known: Multipliers) -> Multipliers:

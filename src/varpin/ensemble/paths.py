@@ -191,7 +191,7 @@ def examine(task: tuple[Shared, int, Floats, Floats]) -> tuple[Finding, ...]:
     motion, _ = Motions(shared.scene, shared.integrator, q0, v0, shared.dt).under(shared.commands, increments=drawn)
     # The loop's check is for held controls.
     held = len(shared.commands.gains) and not shared.linear
-    gains = Gains(shared.commands.gains, shared.integrator.variational)
+    gains = Gains(shared.commands.gains, shared.scene if shared.integrator.variational else None)
     loop = unstable_loop(shared.scene, motion, shared.commands.hold, gains) if held else ()
     return (*loop, *check(shared.scene, shared.integrator, motion, shared.commands if held else None).warnings)
 

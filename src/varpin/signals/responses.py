@@ -5,14 +5,17 @@ H_i is what a displacement of x changes i periods later. Copies of the same mome
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 
 from varpin.arrays import Floats
+from varpin.errors import ControlError
 from varpin.mechanics.scene import Scene
 from varpin.signals.functions import ControlLaw, Copies, copier, decision
+
+# The control u + sum(H) x of a state x at rest: u (m,), H (J, m, 2n), and what later periods multiply it by (m, m).
+Response = tuple[Floats, Floats, Floats]
 
 # Displacement of a coordinate [rad or m, and by s]: above the rounding of laws in single precision.
 _SMALL = 1e-4
@@ -24,49 +27,54 @@ MEMORY = 6
 _SAME = 1e-9
 
 
-def responses(
-    scene: Scene, law: Copies, t: Floats, x: Floats, u: Floats, centres: dict[int, Floats]
-) -> Iterator[tuple[int, Floats, Floats]]:
-    """The controls (m,) of a law at centres of nodes, and its responses (J, m, 2n).
+def responses(scene: Scene, law: Copies, t: Floats, x: Floats, u: Floats) -> Callable[[int, Floats], Response]:
+    """The response of a law in a period, none before that of the last call, at a state (2n,).
 
-    A law that gives recorded controls again at once has no memory; any other is called in order up to each node.
+    A law that gives recorded controls again at once has no memory; any other is called in order up to the period. A
+    ControlError tells of one that does not give them then, or has no copy.
     """
+    own, done, copies = law(), 0, None
 
     def call(own: ControlLaw, k: int, state: Floats, later: int = 0) -> Floats:
         control: Floats = decision(own, scene, k, float(t[k] + later * t[1]), *np.split(state, 2))[0]
         return control
 
-    def gives(own: ControlLaw, k: int) -> bool:
+    def gives(k: int) -> bool:
         return bool(np.allclose(call(own, k, x[k]), u[k], rtol=_SAME, atol=_SAME * np.abs(u[k]).max()))
 
-    def alone(own: ControlLaw, k: int, state: Floats) -> list[Floats]:
-        return [call(own, k, state)]
-
-    def rolled(copies: Copies, k: int, state: Floats) -> list[Floats]:
+    def rolled(copies: Copies, k: int, states: list[Floats]) -> list[Floats]:
         own = copies()
-        return [call(own, k, centres[k] if later else state, later) for later in range(MEMORY)]
+        return [call(own, k, state, later) for later, state in enumerate(states)]
 
-    own, done, remembers = law(), 0, False
-    for k, centre in centres.items():
-        if not remembers:
-            remembers = not gives(own, k)
-            slopes = _slopes(functools.partial(alone, own, k), centre)
-            remembers = remembers or not gives(own, k)
-            own = law() if remembers else own
-        if remembers:
-            copies = copier(own) if all(gives(own, j) for j in range(done, k)) else None
-            if copies is None:
-                return
-            done, slopes = k, _slopes(functools.partial(rolled, copies, k), centre)
-        yield k, *slopes
+    def respond(k: int, centre: Floats) -> Response:
+        nonlocal own, done, copies
+        if copies is None:
+            known = gives(k)
+            found = _slopes(lambda state: [call(own, k, state)], centre)
+            if known and gives(k):
+                return found
+            own = law()
+        if copies is None or k > done:
+            copies, done = copier(own) if all(gives(j) for j in range(done, k)) else None, k
+        if copies is None:
+            raise ControlError(k, float(t[k]), "the control law cannot be called again")
+        roll = copies
+        return _slopes(lambda state: rolled(roll, k, [state, *[centre] * (MEMORY - 1)]), centre)
+
+    return respond
 
 
-def _slopes(roll: Callable[[Floats], list[Floats]], centre: Floats) -> tuple[Floats, Floats]:
-    """The control (m,) at a state (2n,) and the response (J, m, 2n) over J periods that ``roll`` gives; 0 at a kink."""
+def _slopes(roll: Callable[[Floats], list[Floats]], centre: Floats) -> Response:
+    """The response at a state (2n,), from the controls of J periods that ``roll`` gives; 0 at a jump or kink.
+
+    Later periods multiply the last by one number, that of what it remembers.
+    """
+    # Two displacements forward and one back: values beside a jump are no line, even if it is in the middle.
     moved = _SMALL * np.eye(len(centre))
-    up, down = (np.array([roll(centre + side * each) for each in moved]) for side in (1.0, -1.0))
-    first, here = up - down, np.array(roll(centre))
-    H: Floats = np.moveaxis(first, 0, -1) / (2.0 * _SMALL)
-    if np.abs(up + down - 2.0 * here).max() > _KINK * np.abs(first).max():
+    here, up, down = np.array(roll(centre)), *(np.array([roll(centre + far * d) for d in moved]) for far in (2.0, -1.0))
+    H: Floats = np.moveaxis(up + 3.0 * here - 4.0 * down, 0, -1) / (6.0 * _SMALL)
+    if np.abs(up + 2.0 * down - 3.0 * here).max() > _KINK * np.abs(up - down).max():
         H = np.zeros_like(H)
-    return here[0], H[: 1 + max(np.flatnonzero(H.any(axis=(1, 2))), default=0)]
+    H = H[: 1 + max(np.flatnonzero(H.any(axis=(1, 2))), default=0)]
+    ratio = np.vdot(H[-1], H[-2]) / np.vdot(H[-2], H[-2]) if len(H) == MEMORY else 0.0
+    return here[-1] - H.sum(axis=0) @ centre, H, np.clip(ratio, 0.0, 1.0) * np.eye(here.shape[1])

@@ -1,18 +1,20 @@
 """The stability of a digital control loop at its period, from a finished motion and copies of its control law.
 
-At some states of the motion the law is differentiated, :mod:`varpin.signals.responses`, unless its gains are known.
-With the plant's exact step under a zero-order hold, x' = A x + B u, the loop is unstable if the spectral radius of the
-step of (x_k, x_(k-1), ...) exceeds one (Franklin, Powell and Workman 1998, section 4.3). Growth that the law would have
-in continuous time too, as in a falling pendulum, gives no warning. A and B are those of the plant at rest, at the law's
-equilibrium. The gains of plans made anew have none: there the plant is held at the state that the plan leads to.
+At its equilibrium, found for some states of the motion, the law is differentiated, :mod:`varpin.signals.responses`,
+unless its gains are known. With the step of the plant at rest there under a zero-order hold, x' = A x + B u, the loop
+is unstable if the spectral radius of the step of (x_k, x_(k-1), ...) exceeds one (Franklin, Powell and Workman 1998,
+section 4.3). Growth that the law would have in continuous time too, as in a falling pendulum, gives no warning unless
+it doubles deviations in a period. The gains of plans made anew have no equilibrium: there the plant is held at the
+state that the plan is about.
 
 A law that does not respond to small displacements, as at its limits, shows by turning back every few periods.
 """
 
 from __future__ import annotations
 
+import functools
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,7 +28,7 @@ from varpin.integrators.explicit import accelerations
 from varpin.mechanics.assembly import nearest
 from varpin.mechanics.scene import Scene, closest_controls, tangent_basis
 from varpin.signals.functions import Copies
-from varpin.signals.responses import MEMORY, responses
+from varpin.signals.responses import MEMORY, Response, responses
 from varpin.simulation.spectrum import masses
 from varpin.support.one_thread import one_thread
 from varpin.trajectory import Trajectory
@@ -43,8 +45,9 @@ _RANK = 1e-9
 _SINGULAR = 1e-6
 # Least growth a period: rounding of differences may split double eigenvalues by 3e-6. 0 to 1e-5: the same.
 _GROWTH = 1e-5
-# The period causes growth if its exponent exceeds that in continuous time by this factor: 1.1 to 3 give the same.
-_BY_PERIOD = 1.5
+# The period causes growth if its exponent exceeds that in continuous time by this factor: 1.1 to 3 give the same. No
+# more of the latter counts, for what more than doubles in a period is no motion that is meant: 0.2 to 0.6 the same.
+_BY_PERIOD, _MEANT = 1.5, 0.5
 # Ratio of the periods that are tried for a stable one.
 _SHORTER = 0.9
 # Least turns of a control within a window of so many periods, each by this share of its range at least: loops that are
@@ -58,11 +61,8 @@ class Gains(NamedTuple):
     """Linear feedback: gains (P, m, 2n) or, with columns for the previous control, (P, m, 2n + m), of each period."""
 
     rows: Floats
-    momentum: bool  # on (q, p), else on (q, v)
+    of: Scene | None = None  # whose momenta p the gains are on (q, p) for; None: on (q, v)
     reference: Floats | None = None  # where each period leads (P, n) [rad or m]; None: to the feedback's equilibrium
-
-
-Response = tuple[int, Floats, Floats, Floats]  # a node, its control (m,), and ``H`` and ``kept`` of a loop
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class Loop:
         change = np.concatenate([self.kept @ self.H[-1], self.kept - np.eye(len(self.kept))], axis=1) / period
         slow = np.block([[self.A + self.B @ self.H.sum(axis=0), self.B], [change]])
         rate = float(np.linalg.eigvals(slow).real.max())
-        return bool(np.log(radius) > _BY_PERIOD * max(rate, 0.0) * period)
+        return bool(np.log(radius) > _BY_PERIOD * min(max(rate, 0.0) * period, _MEANT))
 
 
 def unstable_loop(
@@ -125,9 +125,9 @@ def unstable_loop(
     t, u, x = trajectory.t[at], trajectory.u[at], np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1)
     if len(at) < 3 or not np.ptp(u, axis=0).any():
         return ()
-    worst, turning = _turning(u)
-    groups = [_spread(nodes) for nodes in (_inside(u), turning)]
     with np.errstate(all="ignore"), one_thread():
+        worst, turning = _turning(u)
+        groups = [_spread(nodes) for nodes in (_inside(u), turning)]
         loops = _loops(scene, law, t, x, u, sorted(set().union(*groups)))
         for nodes in groups:
             found = _by_theory(scene, [loops[k] for k in nodes if k in loops], period)
@@ -169,18 +169,22 @@ def _loops(
     if law is None or scene.inputs:
         return {}
     found: dict[int, Loop] = {}
-    # Oscillations by which controls alternate are at rest in the mean of three states.
-    centres = {k: 0.25 * (x[k - 1] + 2.0 * x[k] + x[k + 1]) for k in nodes}
-    given = _of_gains(scene, law, x, u, centres) if isinstance(law, Gains) else _of_law(scene, law, t, x, u, centres)
+    start, places = x[0, : scene.robot.dof], law.reference if isinstance(law, Gains) else None
+    respond = (
+        functools.partial(_of_gains, scene, law, x, u) if isinstance(law, Gains) else responses(scene, law, t, x, u)
+    )
     try:
-        for k, control, H, kept in given:
-            if not H.any() or not np.isfinite(H).all():
+        for k in nodes:
+            # Oscillations by which controls alternate are at rest in the mean of three states.
+            response = respond(k, 0.25 * (x[k - 1] + 2.0 * x[k] + x[k + 1]))
+            if not response[1].any() or not np.isfinite(response[1]).all():
                 continue
-            if isinstance(law, Gains) and law.reference is not None:
-                q = nearest(scene, law.reference[k]) if scene.constraints else law.reference[k]
+            if places is not None:
+                q = nearest(scene, places[k]) if scene.constraints else places[k]
+                _, H, kept = respond(k, np.append(q, np.zeros_like(q)))
                 found[k], _ = _at_rest(scene, q, closest_controls(scene, q), H, kept)
-            elif loop := _at_equilibrium(scene, x[0, : scene.robot.dof], centres[k], control, H, kept):
-                found[k] = loop
+            elif equilibrium := _at_equilibrium(scene, start, response, functools.partial(respond, k)):
+                start, found[k] = equilibrium
     except (AssemblyError, SingularMassMatrix, ControlError, LinearizationError, np.linalg.LinAlgError) as error:
         logger.debug("a control law is differentiated at %d of %d states: %r", len(found), len(nodes), error)
     return found
@@ -203,7 +207,7 @@ def _by_theory(scene: Scene, loops: Sequence[Loop], period: float) -> tuple[Find
     stable = next((float(T) for T in period * _SHORTER ** np.arange(1, 60) if loop.mode(T)[0] <= 1.0 + _GROWTH), None)
     advice = "lower gains" if stable is None else f"a period below {stable:.3g} s, or lower gains"
     text = (
-        f"control loop is unstable at its period of {period:.4g} s: each period multiplies deviations by {radius:.4g}. "
+        f"control loop is unstable at its period of {period:.4g} s: each period multiplies deviations by {radius:.6g}. "
         f"Use {advice}"
     )
     return _finding(scene, int(np.argmax(sizes)), text, radius)
@@ -225,40 +229,35 @@ def _by_turns(scene: Scene, x: Floats, u: Floats, t: Floats, control: int, turns
     return _finding(scene, control, text, float(len(turns)), float(t[turns[0]]))
 
 
-def _of_gains(scene: Scene, gains: Gains, x: Floats, u: Floats, centres: dict[int, Floats]) -> Iterator[Response]:
-    """The response of linear feedback in the states around nodes, from its controls u (P, m) at x (P, 2n)."""
-    for k, state in centres.items():
-        n = len(state) // 2
-        K, G = np.split(gains.rows[k], [2 * n], axis=1)
-        if gains.momentum:
-            K = np.concatenate([K[:, :n], K[:, n:] @ masses(scene, state[None, :n])[0]], axis=1)
-        control = u[k] + K @ (state - x[k])
-        if G.size:
-            yield k, control, np.array([np.linalg.matrix_power(G, i) @ K for i in range(MEMORY)]), G
-        else:
-            yield k, control, K[None], np.zeros((len(K), len(K)))
+def _of_gains(scene: Scene, gains: Gains, x: Floats, u: Floats, k: int, state: Floats) -> Response:
+    """The response of linear feedback in a period at a state (2n,), from its controls u (P, m) at states x (P, 2n)."""
+    n, m = scene.robot.dof, scene.controls
+    M = np.tile(np.eye(n), (2, 1, 1)) if gains.of is None else masses(gains.of, np.array([state[:n], x[k, :n]]))
+    K, G = np.split(gains.rows[k], [2 * n], axis=1)
+    here, known = (np.concatenate([K[:, :n], K[:, n:] @ each], axis=1) for each in M)
+    kept, J = (G, MEMORY) if G.size else (np.zeros((m, m)), 1)
+    powers = np.array([np.linalg.matrix_power(kept, i) for i in range(J)])
+    return u[k] - powers.sum(axis=0) @ known @ x[k], powers @ here, kept
 
 
-def _of_law(
-    scene: Scene, law: Copies, t: Floats, x: Floats, u: Floats, centres: dict[int, Floats]
-) -> Iterator[Response]:
-    """The response of a law at nodes, by its differences; what follows is a multiple of what it remembers."""
-    for k, control, H in responses(scene, law, t, x, u, centres):
-        ratio = np.vdot(H[-1], H[-2]) / np.vdot(H[-2], H[-2]) if len(H) == MEMORY else 0.0
-        yield k, control, H, np.clip(ratio, 0.0, 1.0) * np.eye(len(control))
+def _at_equilibrium(
+    scene: Scene, q: Floats, response: Response, respond: Callable[[Floats], Response]
+) -> tuple[Floats, Loop] | None:
+    """The equilibrium (n,) that Newton's method finds from q (n,), and the loop there; None if it finds none.
 
-
-def _at_equilibrium(scene: Scene, start: Floats, centre: Floats, u: Floats, H: Floats, kept: Floats) -> Loop | None:
-    """The loop at the equilibrium that Newton's method finds from ``start`` (n,), None if it finds none.
-
-    The law has the control u (m,) at the state ``centre`` (2n,) and the responses H (J, m, 2n) everywhere.
+    The law is differentiated at each iterate at rest. Where a control does not respond there that does in the motion,
+    as at its limit, the law has the response of the last state instead.
     """
-    q, K = start, H.sum(axis=0)
+    responding = response[1].any(axis=(0, 2))
     for _ in range(_ITERATIONS):
         q = nearest(scene, q) if scene.constraints else q
-        loop, way = _at_rest(scene, q, u + K @ (np.append(q, np.zeros_like(q)) - centre), H, kept)
+        here = respond(np.append(q, np.zeros_like(q)))
+        if (here[1].any(axis=(0, 2)) >= responding).all():
+            response = here
+        u, H, kept = response
+        loop, way = _at_rest(scene, q, u + H.sum(axis=0)[:, : len(q)] @ q, H, kept)
         if np.abs(way).max() < _CONVERGED:
-            return loop
+            return q, loop
         q = q + way / max(1.0, np.abs(way).max())
     return None
 

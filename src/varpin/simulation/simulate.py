@@ -183,7 +183,7 @@ def simulate(
     held = commands.hold > 1 and not law
     record = MotionRecord(scene, integrator, dt, dw, start, commands if linear else None, held=held)
     kept = copier(controls) if check and callable(controls) else None
-    fed = kept if law else Gains(commands.gains, integrator.variational)
+    fed = kept if law else Gains(commands.gains, scene if integrator.variational else None)
     loop = functools.partial(unstable_loop, scene, hold=hold, law=fed) if check and hold else None
     interrupted = not _roll(record, state, steps, controls, commands, Reporter(progress, steps, dt), loop)
     motion = record.trajectory()
