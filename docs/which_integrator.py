@@ -222,7 +222,7 @@ def short_entries(case: peers.Case, scale: Scale) -> list[Entry]:
 
 
 def best_of(points: Sequence[Point], motion: str, levels: Iterable[float], names: Sequence[str]) -> list[str]:
-    """Rows of a table: the least time to each error of varpin and of each peer, the least of all in bold."""
+    """Rows of a table: the least time to each error of varpin, with its setting, and of each peer; the least is bold."""
     lines = []
     for level in levels:
         good = [p for p in points if p.error <= level]
@@ -231,7 +231,8 @@ def best_of(points: Sequence[Point], motion: str, levels: Iterable[float], names
         fastest = min((p.microseconds for p in best if p is not None), default=0.0)
         cells = []
         for p in best:
-            text = "-" if p is None else f"{p.microseconds:.0f} ({p.method.removeprefix('MuJoCo ')}, {p.setting})"
+            setting = f" ({p.method}, {p.setting})" if p is not None and p.ours else ""
+            text = "-" if p is None else f"{p.microseconds:.0f}{setting}"
             cells.append(f"**{text}**" if p is not None and p.microseconds == fastest else text)
         lines.append(f"| {motion} | {level:.0e} | {' | '.join(cells)} |")
     return lines
