@@ -222,7 +222,7 @@ def short_entries(case: peers.Case, scale: Scale) -> list[Entry]:
 
 
 def best_of(points: Sequence[Point], motion: str, levels: Iterable[float], names: Sequence[str]) -> list[str]:
-    """Rows of a table: the least time to each error of varpin, with its setting, and of each peer; the least is bold."""
+    """Rows of a table: the least time to each error of varpin, with its setting, and of each peer; the least bold."""
     lines = []
     for level in levels:
         good = [p for p in points if p.error <= level]
