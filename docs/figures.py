@@ -1,4 +1,4 @@
-"""Pictures of replays (a finger, a reach with all that can be marked, a controller), a notebook, an identification.
+"""Pictures of replays (a finger, a reach with all that can be marked, a controller), and a notebook.
 
 Needs Chromium and chromedriver (and ``pip install "varpin[test]"`` for selenium).
 
@@ -7,8 +7,6 @@ Needs Chromium and chromedriver (and ``pip install "varpin[test]"`` for selenium
 
 import io
 import shutil
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -107,13 +105,6 @@ def controller(folder: Path) -> Image.Image:
     return Image.fromarray(picture)
 
 
-def identification(folder: Path) -> Image.Image:
-    """Two joints of a UR5 before and after an identification, as the example draws them."""
-    example = IMAGES.parents[1] / "examples" / "ur5_identification.py"
-    subprocess.run([sys.executable, example], cwd=folder, check=True)
-    return Image.open(folder / "out" / "identification.png")
-
-
 def main() -> None:
     """Draw them."""
     finger = vp.load_robot("finger")
@@ -126,7 +117,6 @@ def main() -> None:
         save_image(reach(Path(folder)), IMAGES / "replay.png")
         save_image(notebook(Path(folder)), IMAGES / "notebook.png")
         save_image(controller(Path(folder)), IMAGES / "controller.png")
-        save_image(identification(Path(folder)), IMAGES / "identification.png")
     figure = Figure(figsize=(11, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
     left.imshow(picture)
