@@ -225,10 +225,10 @@ class Robot(Frozen):
     def end_effector(self) -> str:
         """Name of the frame that is farthest out on the axis of the arm's last joint, as flanges and tools are.
 
-        Of several there, or of all frames that the joint moves if none is on its axis, it is the last one with a name of
-        tools, such as tool0 or tcp, or else the last one. The arm's last joint is the last one above all branches that
-        are more than half as deep as the deepest, and before any finger by its name; where this leaves out more than
-        half of that branch, as of two arms, the deepest joint is.
+        Of several there, or of all frames that the joint moves if none is on its axis, it is the last one; the last one
+        with a name as tools have (tool0, tcp), if there is one. The arm's last joint is the last one above all branches
+        that are more than half as deep as the deepest, and before any finger by its name; where this leaves out more
+        than half of that branch, as of two arms, the deepest joint is.
         """
         model, paths = self.model, [list(joints) for joints in self.model.supports]
         deepest = max(range(model.njoints), key=lambda j: (len(paths[j]), j))
