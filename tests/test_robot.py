@@ -348,10 +348,25 @@ def test_the_end_effector_is_no_camera_and_no_finger(tmp_path):
         for name, at in frames
     ]
     parts = [link("a"), link("b"), joint("shoulder", "base", "a"), joint("wrist", "a", "b", axis="0 0 1"), *plates]
-    names = [vp.load_robot(write_urdf(tmp_path, *parts)).end_effector]
-    names += [vp.load_robot(name).end_effector for name in ("kinova", "ur5", "xarm7", "finger_edu")]
-    names += [vp.load_robot("panda", lock={"panda_finger_joint1": 0.0}).end_effector]
-    assert names == ["flange", "j2s6s200_end_effector", "tool0", "link_eef", "finger_tip_link", "panda_hand_tcp"]
+    assert vp.load_robot(write_urdf(tmp_path, *parts)).end_effector == "flange"
+    tools = {
+        "kinova": "j2s6s200_end_effector",
+        "ur5": "tool0",
+        "xarm7": "link_eef",
+        "finger_edu": "finger_tip_link",
+        "asr_twodof": "Tip",
+        "panda": "panda_hand_tcp",
+        "tiago": "hand_tool_link",
+        "z1": "gripperStator",
+        "so100": "gripper",
+        "so101": "gripper_frame_link",
+        "talos_arm": "wrist_left_ft_tool_link",
+        # Of two arms, and of a hand alone, no joint is the last.
+        "baxter": "r_gripper_r_finger_tip",
+        "allegro_left_hand": "link_11.0_tip",
+    }
+    assert {name: vp.load_robot(name).end_effector for name in tools} == tools
+    assert vp.load_robot("panda", lock={"panda_finger_joint1": 0.0}).end_effector == "panda_hand_tcp"
 
 
 def test_positions_of_frames(load):

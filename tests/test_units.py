@@ -161,9 +161,11 @@ def test_joints_without_limits_may_have_turned_many_times(q, told):
 
 def test_other_positions_in_degrees(scene, caplog):
     vp.load_robot("ur5", lock={"elbow_joint": 90})
+    vp.load_robot(arm(WHEEL, WHEEL).model, lock={"joint1": 57.2957795})
     vp.Scene(scene.robot, stiffness=1.0, rest=HOME)
-    elbow, rest = caplog.messages
+    elbow, wheel, rest = caplog.messages
     assert not unnamed(elbow, ("elbow_joint", "90", "looks like degrees"))
+    assert not unnamed(wheel, ("57.2958", "looks like degrees"))
     assert not unnamed(rest, ("rest", *FACTS))
     with refused(vp.InputError, "q0", *FACTS):
         moved(vp.Scene(scene.robot, constraints=[vp.PointOnPoint("tool0", [0.8, 0.1, 0.2])]), HOME)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import logging
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
 
@@ -24,9 +25,6 @@ from varpin.cli.console import INTERRUPTED, STEP_FAILED, progress_bar, say, show
 from varpin.cli.outputs import PICTURES, add_files, files_of, save_figure, write_all
 from varpin.mechanics.scene import Scene
 from varpin.model import load_robot
-
-if TYPE_CHECKING:
-    from varpin.estimation import Identification
 
 # The default of varpin.identify; after so many of all searches the bar of the progress grows.
 _EXPECTED = 100
@@ -67,9 +65,8 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
 def _identify(request: argparse.Namespace, errors: Console) -> int:
     from varpin.estimation import Log, identify  # noqa: PLC0415 - most commands do not need SciPy's optimizers
 
-    files = files_of(
-        request, ("save", (".urdf",), lambda path, found: found.save_urdf(path)), ("plot", PICTURES, _plot)
-    )
+    urdf = "save", (".urdf",), lambda path, found: found.save_urdf(path)
+    files = files_of(request, urdf, ("plot", PICTURES, partial(save_figure, "plot_identification")))
     scene = _scene(request)
     logs, apart = ([Log.load(path) for path in paths] for paths in (request.logs, request.held_out))
     options: dict[str, Any] = {name: getattr(request, name) for name in ("delay", "dt", "horizon", "evaluations")}
@@ -105,9 +102,3 @@ def _scene(request: argparse.Namespace) -> Scene:
     robot = load_robot(request.robot, **robot_options(request))
     forces: dict[str, Any] = {name: values_of(name, getattr(request, name)) for name in ("damping", "friction")}
     return Scene(robot, gravity=request.gravity, **forces)
-
-
-def _plot(path: Path, found: Identification) -> None:
-    from varpin.show.plots import plot_identification  # noqa: PLC0415 - matplotlib is slow to import
-
-    save_figure(path, plot_identification(found)[0])

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import threading
 from collections.abc import Iterator
 from types import FrameType
 
 from rich.console import Console
-
-from varpin.cli.console import say
 
 
 class Interrupts(contextlib.ExitStack):
@@ -56,9 +55,10 @@ class Interrupts(contextlib.ExitStack):
     def _handle(self, _number: int, _frame: FrameType | None) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         # A progress bar hides the cursor.
-        self._console.show_cursor()
+        cursor = "\x1b[?25h" if self._console.is_terminal else ""
         kept = "; what is done is kept, and a second one ends without it" if self._keeping else ""
-        say(self._console, f"Ctrl-C: stopping{kept}")
+        # Not by the console, which may be writing.
+        os.write(2, f"{cursor}varpin: Ctrl-C: stopping{kept}\n".encode())
         if not self._writing:
             raise KeyboardInterrupt
         self.wanted = True

@@ -67,7 +67,7 @@ def writers_of(request: argparse.Namespace, marks: MarksOf | None = None) -> Wri
     return files_of(
         request,
         ("save", (".npz",), lambda path, _robot, _motion, result: result.save(path)),
-        ("plot", PICTURES, _plot),
+        ("plot", PICTURES, lambda path, robot, motion, _: save_figure("plot_trajectory", path, motion, robot=robot)),
         ("html", (".html", ".htm"), partial(show, "html")),
         ("video", FORMATS, partial(show, "video")),
     )
@@ -91,14 +91,11 @@ def files_of(request: argparse.Namespace, *options: tuple[str, Sequence[str], Ca
     return found
 
 
-def _plot(path: Path, robot: Robot, motion: Trajectory, _result: object) -> None:
-    from varpin.show.plots import plot_trajectory  # noqa: PLC0415 - matplotlib is slow to import
+def save_figure(plot: str, path: Path, result: object, **options: Any) -> None:
+    """Write the figure that a function of :mod:`varpin.show.plots` draws of a result, in the format of the path."""
+    from varpin.show import plots  # noqa: PLC0415 - matplotlib is slow to import
 
-    save_figure(path, plot_trajectory(motion, robot=robot)[0])
-
-
-def save_figure(path: Path, figure: Any) -> None:
-    """Write a figure in the format of the path."""
+    figure = getattr(plots, plot)(result, **options)[0]
     with atomic_file(path) as stream:
         figure.savefig(stream, format=path.suffix[1:].lower(), dpi=150)
 

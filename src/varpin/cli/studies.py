@@ -6,7 +6,7 @@ import argparse
 import logging
 import shlex
 from collections.abc import Callable
-from pathlib import Path
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from rich.console import Console
@@ -126,13 +126,8 @@ def _add_duration(parser: argparse.ArgumentParser) -> None:
 
 def _files(request: argparse.Namespace) -> Writers:
     """Writers of the requested files of a study."""
-    return files_of(request, ("save", (".csv",), lambda path, study: study.to_csv(path)), ("plot", PICTURES, _plot))
-
-
-def _plot(path: Path, study: Study[Any]) -> None:
-    from varpin.show.plots import plot_study  # noqa: PLC0415 - matplotlib is slow to import
-
-    save_figure(path, plot_study(study)[0])
+    table = "save", (".csv",), lambda path, study: study.to_csv(path)
+    return files_of(request, table, ("plot", PICTURES, partial(save_figure, "plot_study")))
 
 
 def _kept(request: argparse.Namespace, errors: Console, study: Callable[[Progress], Made]) -> Made:

@@ -78,7 +78,7 @@ class OptimalControlProblem(Frozen):
 
         cost = vp.TrackingCost(reference, 10.0) + vp.ControlCost(0.1) + vp.Terminal(2.0 * vp.TrackingCost(goal))
 
-    Every control needs a cost of its own, such as :class:`varpin.ControlCost`.
+    A control that nothing charges or limits may be of any size: give each a small :class:`varpin.ControlCost`.
 
     Attributes:
         scene: The scene, its noise included.

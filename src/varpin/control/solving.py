@@ -34,7 +34,7 @@ from varpin.simulation.spectrum import masses
 from varpin.support.checks import (
     JointValues,
     as_floats,
-    control_array,
+    control_values,
     count,
     finite_array,
     flag,
@@ -366,6 +366,6 @@ def _rows_of(problem: OptimalControlProblem, controls: Any) -> Floats:
     """Given controls as rows (R, m)."""
     R, m = problem.decisions, problem.scene.controls
     if isinstance(controls, Mapping):
-        controls = control_array("controls", controls, problem.scene.control_joints)
+        controls = control_values("controls", controls, problem.scene.control_joints, m)
     rows = as_floats("controls", controls)
     return np.broadcast_to(finite_array("controls", rows, (m,) if rows.ndim == 1 else (R, m)), (R, m))

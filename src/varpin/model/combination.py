@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from types import MappingProxyType
@@ -92,19 +93,11 @@ def combine(
     )
 
 
-def _names(robot: Robot) -> set[str]:
-    return {*list(robot.model.names)[1:], *(frame.name for frame in list(robot.model.frames)[1:])}
-
-
 def _twice(robots: Sequence[Robot], prefixes: Sequence[str]) -> list[str]:
-    """Names that several robots share."""
-    seen: set[str] = set()
-    twice = []
-    for robot, prefix in zip(robots, prefixes, strict=True):
-        names = {prefix + name for name in _names(robot)}
-        twice += sorted(names & seen)
-        seen |= names
-    return twice
+    """Names of joints and frames that several robots share."""
+    own = ({*list(x.model.names)[1:], *(frame.name for frame in list(x.model.frames)[1:])} for x in robots)
+    counts = Counter(prefix + name for names, prefix in zip(own, prefixes, strict=True) for name in sorted(names))
+    return [name for name, robots_with in counts.items() if robots_with > 1]
 
 
 def _prefixes(robots: Sequence[Robot]) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from varpin.model.mimic import joint_index
 from varpin.model.robot import Robot, limits_of
 from varpin.model.sources import describe
 from varpin.model.tree import is_unbounded, joint_axis
-from varpin.model.units import ADVICE, typed_in_degrees
+from varpin.model.units import ADVICE, NO_LIMIT, TURNS
 from varpin.support.checks import (
     JointValues,
     as_floats,
@@ -269,7 +269,8 @@ def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
     require_finite(name, position)
     if kind.nv == 1:
         low, high, *_ = limits_of(model, joint)
-        if not kind.shortname().startswith("JointModelP") and typed_in_degrees(position)[0]:
+        # A lock has no motion behind it in which the joint may have turned.
+        if not kind.shortname().startswith("JointModelP") and TURNS < abs(position[0]) < NO_LIMIT:
             logger.warning("%s = %g looks like degrees: %s", name, position[0], ADVICE)
         elif low < high and not low - _OUTSIDE <= position[0] <= high + _OUTSIDE:
             unit = "m" if joint_axis(model, joint)[0] else "rad"

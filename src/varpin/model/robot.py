@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import takewhile
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -34,6 +36,9 @@ _HUGE = 1e300
 # Distance [m] of a frame from a joint's axis that is none: more than what rounded angles of a file make, and less than
 # cameras and fingers are aside.
 _ASIDE = 1e-3
+# Names of joints of grippers, whose last one moves a jaw alone; and of frames of tools.
+_FINGER = re.compile("finger|gripper|jaw", re.IGNORECASE)
+_TOOL = re.compile(r"(^|_)(tool\d?|tcp|eef?|end_effector|flange)(_|$)")
 
 
 class Part(NamedTuple):
@@ -218,17 +223,26 @@ class Robot(Frozen):
 
     @cached_property
     def end_effector(self) -> str:
-        """Name of the frame that is farthest out on the axis of the joint with the most ancestors, as flanges are.
+        """Name of the frame that is farthest out on the axis of the arm's last joint, as flanges and tools are.
 
-        It is the last one of several there, or of all frames that the joint moves if none is on its axis.
+        Of several there, or of all frames that the joint moves if none is on its axis, it is the last one; the last one
+        with a name as tools have (tool0, tcp), if there is one. The arm's last joint is the last one above all branches
+        that are more than half as deep as the deepest, and before any finger by its name; where this leaves out more
+        than half of that branch, as of two arms, the deepest joint is.
         """
-        depths = [len(path) for path in self.model.supports]
-        last = max(range(self.model.njoints), key=lambda j: (depths[j], j))
-        frames = [frame for frame in self.model.frames if frame.parentJoint == last]
-        places, axis = np.array([frame.placement.translation for frame in frames]), joint_axis(self.model, last)[1]
+        model, paths = self.model, [list(joints) for joints in self.model.supports]
+        deepest = max(range(model.njoints), key=lambda j: (len(paths[j]), j))
+        # The paths begin with the world, which is no joint.
+        half = 0.5 * (len(paths[deepest]) - 1)
+        branches = (set(path) for path in paths if not model.children[path[-1]] and len(path) - 1 > half)
+        *_, last = takewhile(lambda j: not _FINGER.search(model.names[j]), sorted(set.intersection(*branches)))
+        last = deepest if len(paths[last]) - 1 < half else last
+        frames = [frame for frame in model.frames if frame.parentJoint == last]
+        places, axis = np.array([frame.placement.translation for frame in frames]), joint_axis(model, last)[1]
         out = np.abs(places @ axis)
         out[np.linalg.norm(np.cross(places, axis), axis=1) > _ASIDE] = 0.0
-        return str(frames[np.flatnonzero(out > out.max() - _ASIDE)[-1]].name)
+        names = [frames[k].name for k in np.flatnonzero(out > out.max() - _ASIDE)]
+        return ([name for name in names if _TOOL.search(name)] or names)[-1]
 
     def frame_positions(self, q: ArrayLike, frame: str | None = None) -> Floats:
         """World positions (..., 3) [m] of a frame, or of :attr:`end_effector`, at ``q`` (..., n).

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from varpin.model.robot import Robot
 
 # Largest plausible angle [rad]: two turns.
-_TURNS = 4.0 * math.pi
+TURNS = 4.0 * math.pi
 ADVICE = "angles are in radians, np.deg2rad makes them of degrees"
 
 # A joint whose limit is larger [rad or m] has none: exporters write 1e9, 1e16 or the largest double. Nobody types
@@ -42,7 +42,7 @@ def joint_unit(robot: Robot, coordinates: int | Sequence[int] | slice = slice(No
 def typed_in_degrees(angles: Floats) -> NDArray[np.bool_]:
     """Whether angles [rad] are larger than two turns and have at most one decimal, as someone types degrees."""
     tenths = 10.0 * np.clip(angles, -NO_LIMIT, NO_LIMIT)
-    return (np.abs(angles) > _TURNS) & (np.abs(angles) < NO_LIMIT) & (tenths == np.round(tenths))
+    return (np.abs(angles) > TURNS) & (np.abs(angles) < NO_LIMIT) & (tenths == np.round(tenths))
 
 
 def in_degrees(robot: Robot, name: str, values: Floats, *, speed: bool = False) -> tuple[Finding, ...]:
@@ -60,7 +60,7 @@ def in_degrees(robot: Robot, name: str, values: Floats, *, speed: bool = False) 
     wrong = ~robot.slides & (outside & typed if speed else np.where(bounded, outside, typed))
     joint = int(np.argmax(np.where(wrong, np.abs(most), 0.0)))
     value, name_of, per = float(most[joint]), robot.joint_names[joint], "/s" if speed else ""
-    if not (wrong[joint] and abs(value) > _TURNS):
+    if not (wrong[joint] and abs(value) > TURNS):
         return ()
     turns = f"{abs(value) / (2.0 * math.pi):.0f} turns{per}"
     text = f"{name} of {name_of!r} is {value:.4g} rad{per}, {turns}, and looks like degrees: {ADVICE}"

@@ -14,7 +14,7 @@ from varpin.mechanics.scene import Scene
 from varpin.signals.commands import Times, changing, on_lines, open_line, open_loop, prescribing
 from varpin.signals.functions import Sampled
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
-from varpin.support.checks import JointValues, as_floats, control_array, require_finite
+from varpin.support.checks import JointValues, as_floats, control_values, require_finite
 
 # All controls but a control law: known before the motion, or fed back by the core.
 Controls = JointValues | LinearPolicy | OpenLoop | FirstOrderHold | None
@@ -84,7 +84,7 @@ def control_rows(scene: Scene, controls: JointValues | None, steps: int | None =
     if controls is None:
         return np.zeros((1 if steps is None else steps, m))
     if isinstance(controls, Mapping):
-        controls = control_array("controls", controls, scene.control_joints)
+        controls = control_values("controls", controls, scene.control_joints, m)
     if hasattr(controls, "policy"):
         raise InputError("controls is a plan: give its law, plan.policy, or its controls, plan.trajectory.u")
     array = as_floats("controls", controls)

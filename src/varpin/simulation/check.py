@@ -343,12 +343,11 @@ def error_findings(
     lasting = np.minimum(speed_off[: last - 1], speed_off[1:last]) / speed
     if len(lasting) and lasting.max() > TOLD_VELOCITY:
         first, joint = divmod(int(lasting.argmax()), lasting.shape[1])
-        share = float(lasting[first, joint])
         unit = joint_unit(scene.robot, joint, speed=True)
-        value = float(speed_off[first, joint])
+        value, most = float(speed_off[first, joint]), float(np.abs(v[:, joint]).max())
         text = (
-            f"the velocity of joint {names[joint]!r} is off by up to {value:.2g} {unit}, {100.0 * share:.2g} % of its "
-            f"largest (t = {t[first]:.3g} s). {cure(share / TOLD_VELOCITY)}"
+            f"the velocity of joint {names[joint]!r} is off by up to {value:.2g} {unit}, beside {most:.2g} at most "
+            f"(t = {t[first]:.3g} s). {cure(float(lasting[first, joint]) / TOLD_VELOCITY)}"
         )
         return (Finding("error", text, names[joint], time=float(t[first]), value=value, unit=unit),)
     if last < len(off):

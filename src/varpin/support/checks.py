@@ -104,27 +104,20 @@ def joint_array(
     return array
 
 
-def control_array(
-    name: str, value: Mapping[str, float], joints: Sequence[str] | None, *, absent: float = 0.0
-) -> Floats:
-    """``value``, by the names of the driven joints, as a new float array (m,); ``absent`` for those not named."""
-    if joints is None:
-        raise InputError(
-            f"{name} is given by joint name, but the joint that each control drives is not known: give numbers in the "
-            "order of the controls"
-        )
-    return joint_array(name, value, joints, absent=absent, lack="no control is the force of a joint")
-
-
 def control_values(
     name: str, value: JointValues, joints: Sequence[str] | None, m: int, *, uniform: bool = False, absent: float = 0.0
 ) -> Floats:
-    """``value``, (m,) or by joint name, as a new float array (m,); errors as :func:`control_array`.
+    """``value``, (m,) or by the names of the driven joints, as a new float array (m,); ``absent`` for those not named.
 
     With ``uniform`` it may be one number for all controls, and need not be finite where ``absent`` is not.
     """
     if isinstance(value, Mapping):
-        return control_array(name, value, joints, absent=absent)
+        if joints is None:
+            raise InputError(
+                f"{name} is given by joint name, but the joint that each control drives is not known: give numbers in "
+                "the order of the controls"
+            )
+        return joint_array(name, value, joints, absent=absent, lack="no control is the force of a joint")
     if uniform:
         return broadcast_array(name, value, m, limit=not math.isfinite(absent))
     return finite_array(name, value, (m,))

@@ -13,7 +13,9 @@ from threadpoolctl import ThreadpoolController
 class OneThread(ContextDecorator):
     """Limits the process' linear algebra to one thread, from the first that enters to the last that leaves.
 
-    The number of threads belongs to the process: whoever restored it alone would change it for the others.
+    The number of threads belongs to the process: whoever restored it alone would change it for the others. A second
+    thread saves a search within constraints a tenth of its time. But threads that wait for each other spin: of two such
+    searches at a time on two cores, each would take ten times as long.
     """
 
     def __init__(self) -> None:
@@ -35,11 +37,5 @@ class OneThread(ContextDecorator):
                 self._limit.close()
 
 
-@functools.cache
-def one_thread() -> OneThread:
-    """The limit of this process.
-
-    A second thread saves a search within constraints a tenth of its time. But threads that wait for each other spin: of
-    two such searches at a time on two cores, each would take ten times as long.
-    """
-    return OneThread()
+# The limit of this process.
+one_thread = functools.cache(OneThread)

@@ -26,7 +26,7 @@ from varpin.core import Subject
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
 from varpin.model.kinematics import require_same
-from varpin.support.checks import JointValues, as_floats, control_array, control_values, joint_array, some_limits
+from varpin.support.checks import JointValues, as_floats, control_values, joint_array, some_limits
 from varpin.support.frozen import Frozen
 
 
@@ -47,7 +47,7 @@ class _Quadratic(LeastSquares):
 
         def named(what: str, values: Mapping[str, float]) -> Floats:
             if of_controls:
-                return control_array(f"{name} {what}", values, points.control_joints)
+                return control_values(f"{name} {what}", values, points.control_joints, points.controls)
             return joint_array(f"{name} {what}", values, points.joints)
 
         weight, given = self.weight, self.reference
@@ -193,7 +193,7 @@ def control_rate(cost: Cost, controls: int, joints: Sequence[str] | None = None)
             continue
         entries = term.weight
         if isinstance(entries, Mapping):
-            entries = checked_weight(name, control_array(f"{name} weight", entries, joints))
+            entries = checked_weight(name, control_values(f"{name} weight", entries, joints, controls))
         weight += term.factor * weight_matrix(name, entries, controls)
         start = term.before
         if start is not None:

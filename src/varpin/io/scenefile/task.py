@@ -20,16 +20,16 @@ from varpin.io.scenefile import kinds
 from varpin.io.scenefile.reading import SceneFileError, Where
 from varpin.io.scenefile.references import Reader, Timeline, timeline
 from varpin.mechanics.description import description_constraints
-from varpin.mechanics.forces import Force, PositionServo
+from varpin.mechanics.forces import PositionServo
 from varpin.mechanics.noise import Noise
 from varpin.mechanics.reduction import Required, driving, idle_joints, report
 from varpin.mechanics.scene import Scene, closest_controls, joints_with
 from varpin.model import Robot, combine, load_robot
 from varpin.model.clearance import Obstacle
 from varpin.model.inertia import Payload
-from varpin.model.tree import frame_of
+from varpin.model.tree import path_coordinates, place_of_frame
 from varpin.simulation.start import on_constraints, time_steps
-from varpin.support.checks import count, flag
+from varpin.support.checks import count, flag, joint_array
 
 # Largest number of steps; with costs a tenth of it by their number, as each evaluates its reference at each step.
 _MOST_STEPS, _PER_COST = 10**7, 10
@@ -158,15 +158,6 @@ def _obstacle(where: Where, word: str, make: Callable[..., Obstacle], own: dict[
     return where.call(make, own)
 
 
-def joints_of_frame(robot: Robot, frame: str) -> Mask:
-    """Whether each coordinate (n,) moves a frame."""
-    model, moving = robot.model, np.zeros(robot.dof, dtype=np.bool_)
-    for joint in model.supports[frame_of(model, frame, robot.name).parentJoint]:
-        if joint > 0:
-            moving[robot.tree.coordinate[joint - 1]] = True
-    return moving
-
-
 def required_of(task: Task, *, idle: bool) -> tuple[Task, Required]:
     """The task without idle joints, unless they stay, and the report on it."""
     scene, kept = task.scene, task.where.entries(task.tables, "plan_constraint", kinds.PLAN_CONSTRAINTS)
@@ -202,7 +193,8 @@ def _touched(cost: Any, task: Task) -> Mask:
     if isinstance(cost, costs.CenterOfMassCost):
         return np.ones(len(still), dtype=np.bool_)
     if hasattr(cost, "frame"):
-        return joints_of_frame(scene.robot, cost.frame)
+        body, *_ = place_of_frame(scene.robot.model, cost.frame, scene.robot.name)
+        return np.isin(np.arange(len(still)), path_coordinates(scene.robot.tree, body))
     if isinstance(cost, costs.JointLimitBarrier | costs.VelocityLimitBarrier):
         rest = task.q0 if isinstance(cost, costs.JointLimitBarrier) else still
         beyond = (rest > cost.limits[1] - cost.margin) | (rest < cost.limits[0] + cost.margin)
@@ -284,22 +276,26 @@ def _on_robot(root: Where, tables: Mapping[str, Any], robot: Robot, dt: float, s
     driven, gear, limit = _actuation(root.at("actuation"), tables.get("actuation", {}), robot)
     matrix = np.zeros((robot.dof, len(driven)))
     matrix[[robot.coordinate(joint) for joint in driven], np.arange(len(driven))] = gear
+    forces = _forces(root, tables, robot, driven, limit)
     own = root.entries(tables, "constraint", kinds.CONSTRAINTS)
-    constraints = [_bound(where, kind, keys, robot) for where, _, kind, keys in own]
+    constraints = [_made(where, kind, keys) for where, _, kind, keys in own]
     given = {
         "gravity": tables.get("gravity", True),
         "damping": tables.get("damping"),
         "friction": tables.get("friction"),
         "stiffness": springs.get("stiffness", 0.0),
         "rest": root.at("springs", "rest").positions(springs.get("rest", 0.0), robot),
-        "forces": _forces(root, tables, robot, driven, limit),
+        "forces": [force for force, *_ in forces],
         "actuation": matrix,
         "noise": _noise(root, tables, robot, driven) or None,
-        "constraints": constraints or None,
+        "constraints": [constraint for constraint, *_ in constraints] or None,
     }
     try:
         scene = Scene(robot, **given)
     except VarpinError as error:
+        for made, where, keys in (*forces, *constraints):
+            with where.named(keys):
+                description_constraints(robot) if made == "robot" else made.bind(robot)
         words = {"stiffness": "springs.stiffness", "Noise": "noise", "control": "actuation", "Servo": "force"}
         key = next((key for word, key in words.items() if word in str(error)), root.of(error, given).key)
         raise SceneFileError(root.path.name, key, str(error)) from None
@@ -347,34 +343,32 @@ def _actuation(where: Where, given: Any, robot: Robot) -> tuple[tuple[str, ...],
     return tuple(driven), gear, limit
 
 
-def _bound(where: Where, kind: Any, own: dict[str, Any], robot: Robot) -> Any:
-    """A force or a constraint of the keys of a table, which fits the robot."""
+def _made(where: Where, kind: Any, own: dict[str, Any]) -> tuple[Any, Where, dict[str, Any]]:
+    """A force or a constraint of the keys of a table, its place, and these keys."""
     points = {
         name: (value["frame"], value["place"])
         for name, value in own.items()
         if isinstance(value, dict) and value.keys() == {"frame", "place"}
     }
-    made = where.call(kind, own | points)
-    with where.named(own | points):
-        description_constraints(robot) if made == "robot" else made.bind(robot)
-    return made
+    return where.call(kind, own | points), where, own | points
 
 
-def _forces(root: Where, tables: Mapping[str, Any], robot: Robot, driven: Sequence[str], limit: Floats) -> list[Force]:
-    """The forces of a file. Torque limits of driven joints bound the effort of servos."""
+def _forces(
+    root: Where, tables: Mapping[str, Any], robot: Robot, driven: Sequence[str], limit: Floats
+) -> list[tuple[Any, Where, dict[str, Any]]]:
+    """The forces of a file, as :func:`_made`. Torque limits of driven joints bound the effort of servos."""
     most = np.full(robot.dof, np.inf)
     most[[robot.coordinate(joint) for joint in driven]] = limit
-    found: list[Force] = []
+    found = []
     for place, word, kind, own in root.entries(tables, "force", kinds.FORCES):
         if word == "friction" and own.get("level") == "robot":
             own["level"] = robot.friction
-        force = _bound(place, kind, own, robot)
-        if isinstance(force, PositionServo) and np.isfinite(most).any():
-            bounds = np.full(robot.dof, np.inf)
-            for servo in force.bind(robot):
-                bounds[servo.coordinate] = servo.values[2]
-            force = replace(force, effort=np.minimum(bounds, most))
-        found.append(force)
+        force, *where = _made(place, kind, own)
+        if isinstance(force, PositionServo):
+            with place.named(own):
+                effort = joint_array("effort", force.effort, robot.joint_names, uniform=True, absent=np.inf)
+            force = replace(force, effort=np.minimum(effort, most))
+        found.append((force, *where))
     return found
 
 
