@@ -8,6 +8,7 @@ import pickle
 import socket
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -186,6 +187,17 @@ def test_pickles_are_not_opened(name, tmp_path):
     with np.load(path, allow_pickle=True) as archive:
         archive["format"]
     assert witness.exists()
+
+
+def test_a_wrong_shape_costs_no_memory(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, **{**members_of("trajectory.npz"), "q": np.zeros((10_000_000, 1, 1))})
+    assert path.stat().st_size > 1_000
+    tracemalloc.start()
+    with refused(vp.FileError, "a.npz", "q", "(10000000, 1, 1)"):
+        vp.Trajectory.load(path)
+    assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    tracemalloc.stop()
 
 
 def test_names_that_are_too_long_are_refused_by_name(tmp_path):

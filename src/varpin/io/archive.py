@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import io
 import os
 import reprlib
 import secrets
 import socket
 import typing
+import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from enum import Enum
@@ -55,28 +57,61 @@ def save_npz(path: str | os.PathLike[str], form: str, record: Any) -> Path:
     return Path(path)
 
 
-def read_npz(source: Path, *forms: str) -> dict[str, NDArray[Any]]:
-    """The arrays of an npz file, which must be of one of the formats ``forms`` if there are any."""
-    if os.path.isdir(source):  # noqa: PTH112 - pathlib raises an OSError for a path that is too long
-        raise FileError(f"{source} is a folder, not an npz file")
-    if not is_file(source):
-        raise FileError(f"there is no file {source}")
-    members, name = dict[str, NDArray[Any]](), "its list of arrays"
-    try:
-        # Not np.load, which for a file of another kind says how to open pickles.
-        with source.open("rb") as stream, np.lib.npyio.NpzFile(stream, allow_pickle=False) as archive:
-            for name in archive.files:
-                members[name] = np.asarray(archive[name], order="C")
-    except OSError as error:
-        raise FileError(f"cannot read {source}: {error.strerror or error}") from None
-    # On a damaged archive zipfile, zlib and NumPy raise many kinds of errors.
-    except Exception as error:
-        raise FileError(f"{source} is not an npz file, or is truncated or damaged in {name}: {error}") from None
-    found = str(members.get("format", ""))
+class Entry:
+    """An array of an npz file, of which the header alone has been read; ``np.asarray`` reads the rest."""
+
+    def __init__(self, source: Path, archive: zipfile.ZipFile, name: str) -> None:
+        self.source, self.name = source, name
+        with archive.open(f"{name}.npy") as stream:
+            try:
+                version, _ = np.lib.format.read_magic(stream)
+                read = np.lib.format.read_array_header_1_0 if version == 1 else np.lib.format.read_array_header_2_0
+                self.shape, _, self.dtype = read(stream)
+            except ValueError as error:
+                raise FileError(f"{source}: {name} is not an array: {error}") from None
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        with _opened(self.source) as archive:
+            # Read the whole entry: zipfile compares the checksum only at its end.
+            content = io.BytesIO(archive.read(f"{self.name}.npy"))
+        try:
+            array = np.asarray(np.lib.format.read_array(content, allow_pickle=False), order="C")
+        except ValueError as error:
+            raise FileError(f"{self.source}: {self.name} is not an array: {error}") from None
+        return array if dtype is None else array.astype(dtype)
+
+
+def read_npz(source: Path, *forms: str) -> dict[str, Entry]:
+    """The headers of the arrays of an npz file, which must be of one of the formats ``forms`` if there are any.
+
+    Each array is read where it is asked for, so that a wrong shape is found before its data.
+    """
+    with _opened(source) as archive:
+        names = [name.removesuffix(".npy") for name in archive.namelist()]
+        members = {name: Entry(source, archive, name) for name in names}
+    found = str(np.asarray(members.get("format", "")))
     if forms and found not in forms:
         what = f"its format is {reprlib.repr(found)}" if found else "it has no format"
         raise FileError(f"{source} is another kind of file: {what} instead of {' or '.join(map(repr, forms))}")
     return members
+
+
+@contextlib.contextmanager
+def _opened(source: Path) -> Iterator[zipfile.ZipFile]:
+    if os.path.isdir(source):  # noqa: PTH112 - pathlib raises an OSError for a path that is too long
+        raise FileError(f"{source} is a folder, not an npz file")
+    if not is_file(source):
+        raise FileError(f"there is no file {source}")
+    try:
+        with zipfile.ZipFile(source) as archive:
+            yield archive
+    except FileError:
+        raise
+    except OSError as error:
+        raise FileError(f"cannot read {source}: {error.strerror or error}") from None
+    # On a damaged archive zipfile, zlib and NumPy raise many kinds of errors.
+    except Exception as error:
+        raise FileError(f"{source} is not an npz file, or it is truncated or damaged: {error}") from None
 
 
 def members_of(record: Any, prefix: str = "") -> dict[str, Any]:
@@ -109,7 +144,7 @@ def _plain(value: Any) -> Any:
 
 def record_of(
     kind: type[T],
-    members: Mapping[str, NDArray[Any]],
+    members: Mapping[str, Entry],
     source: Path,
     sizes: Mapping[str, int] | None = None,
     known: Mapping[str, Any] | None = None,
@@ -128,7 +163,7 @@ class _Reader:
     """Records from the entries of a file."""
 
     source: Path
-    members: Mapping[str, NDArray[Any]]
+    members: Mapping[str, Entry]
     sizes: dict[Any, int]  # of the axes that are known so far
 
     def error(self, name: str, found: object, expected: str) -> FileError:
@@ -173,7 +208,7 @@ class _Reader:
                 raise self.error(own, f"a column of {len(columns[-1])} rows", f"{len(columns[0])} as the first one")
         return tuple(kind(*row) for row in zip(*columns, strict=True))
 
-    def entry(self, name: str) -> NDArray[Any]:
+    def entry(self, name: str) -> Entry:
         if name not in self.members:
             raise FileError(f"{self.source}: {name} is missing")
         return self.members[name]
@@ -187,17 +222,18 @@ class _Reader:
         if not fits or any(isinstance(a, int) and a != b for a, b in zip(expected, found.shape, strict=True)):
             raise self.error(name, f"{found.dtype} {found.shape}", f"{kind} ({', '.join(map(str, expected))})")
         self.sizes.update((axis, size) for axis, size in zip(names, found.shape, strict=True) if isinstance(axis, str))
-        if axes is not None and axes.finite and not np.isfinite(found).all():
+        whole = np.asarray(found)
+        if axes is not None and axes.finite and not np.isfinite(whole).all():
             raise FileError(f"{self.source}: {name} holds values that are not finite numbers")
-        found.setflags(write=False)
-        return found
+        whole.setflags(write=False)
+        return whole
 
     def listed(self, name: str, axes: int) -> Any:
         """A single value, or a list of them."""
         found = self.entry(name)
         if len(found.shape) != axes:
             raise self.error(name, f"{found.dtype} {found.shape}", "a list" if axes else "a single value")
-        return found.tolist()
+        return np.asarray(found).tolist()
 
     def scalar(self, kind: Any, value: Any, name: str) -> Any:
         if issubclass(kind, Finding) and isinstance(value, str):
