@@ -61,12 +61,18 @@ OBSTACLES: Mapping[str, Callable[..., Obstacle]] = {
     name: getattr(Obstacle, name) for name in ("sphere", "capsule", "box", "convex", "mesh")
 }
 COSTS: Mapping[str, type[Cost]] = {
-    _word_of(name): getattr(costs, f"{name}Cost")
-    for name in (
-        *("Tracking", "Velocity", "Control", "ControlRate", "FramePosition", "FrameOrientation", "FrameVelocity"),
-        *("CenterOfMass", "Manipulability"),
-    )
-} | {"joint_limits": costs.JointLimitBarrier, "velocity_limits": costs.VelocityLimitBarrier}
+    "tracking": costs.TrackingCost,
+    "velocity": costs.VelocityCost,
+    "control": costs.ControlCost,
+    "control_rate": costs.ControlRateCost,
+    "frame_position": costs.FramePositionCost,
+    "frame_orientation": costs.FrameOrientationCost,
+    "frame_velocity": costs.FrameVelocityCost,
+    "center_of_mass": costs.CenterOfMassCost,
+    "manipulability": costs.ManipulabilityCost,
+    "joint_limits": costs.JointLimitBarrier,
+    "velocity_limits": costs.VelocityLimitBarrier,
+}
 COST_WORDS = {kind: word for word, kind in COSTS.items()}
 # Costs whose components are joints, or controls; and names of the components of others: weights, and targets.
 OF_JOINTS = ("tracking", "velocity", "joint_limits", "velocity_limits")
