@@ -612,6 +612,21 @@ def test_distances_are_those_of_least_squares(points, made):
     assert clear > 15
 
 
+def test_a_plane_is_the_same_with_a_normal_of_any_length():
+    planes = [vp.KeepInHalfSpace(TWO, "tip", [0.0, 0.0, -size], 1.5 * size) for size in (1.0, 2.0)]
+    below = [vp.solve(reach(plane), max_iterations=0).violation for plane in planes]
+    assert below[0] == pytest.approx(below[1], rel=1e-12)
+    assert below[0] > 0.1
+
+
+def test_links_that_overlap_at_rest_do_not_clear_each_other():
+    """Of three links in a row the outer ones are no neighbours: thick ones overlap at all angles, and have no pair."""
+    robot = vp.planar_chain(4)
+    for radius, pairs in ((0.05, 3), (0.6, 1)):
+        thick = {f"joint{k}": ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], radius) for k in range(1, 5)}
+        assert len(clearance(robot, [], itself=True, capsules=thick).pairs) == pairs
+
+
 def test_slopes_are_differences():
     robot = vp.load_robot("ur5")
     made = [
