@@ -243,6 +243,12 @@ def test_verification_tells_what_the_continuous_robot_violates():
     assert far.verify().open_loop_constraints[0].violation == pytest.approx(0.5, rel=0.1)
 
 
+def test_before_the_first_node_a_start_outside_is_no_violation():
+    plan = vp.solve(reach(vp.WithinJointLimits(TWO, ([0.01, -np.inf], np.inf)), between_nodes=True))
+    assert plan.violation <= 1e-9
+    assert plan.verify().violation < 1e-4
+
+
 def test_a_motion_with_feedback_that_runs_away_is_no_small_violation():
     seen = SMALL["held, speeds"].plan.verify()
     (own,) = seen.constraints
