@@ -172,6 +172,21 @@ def test_the_decision_without_a_minimum_is_told():
     assert run_over(given, *terminal(4), roots=False)[0] == 3
 
 
+@pytest.mark.parametrize("roots", [False, True], ids=["plain", "roots"])
+def test_a_control_without_any_effect_leaves_the_others_as_they_are(roots):
+    given, ends = random_steps(2, 3, 0, seed=6), terminal(4)
+    given["B"][..., 2] = given["gradient"][:, 6] = 0.0
+    given["hessian"][:, 6] = given["hessian"][:, :, 6] = 0.0
+    failed, ours, _ = run_over(given, *ends, roots=roots)
+    assert failed == -1
+    others = {"B": given["B"][..., :2], "Gu": given["Gu"][..., :2]}
+    others |= {"gradient": given["gradient"][:, :6], "hessian": given["hessian"][:, :6, :6]}
+    right, _ = plainly(given | others, 1, 0.0, *ends)
+    for name in ("feedforward", "feedback"):
+        assert_allclose(ours[name][:, :2], right[name], rtol=1e-8, atol=1e-10)
+        assert not ours[name][:, 2].any()
+
+
 def test_what_is_written_to_is_never_a_copy():
     given, run = random_steps(2, 2, 1, seed=3), core.BackwardPass(2, *terminal(4))
     for strided in (np.zeros((6, 4))[:, ::2], np.zeros((6, 2), dtype=np.float32)):

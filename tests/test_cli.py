@@ -76,6 +76,9 @@ def test_start_is_at_rest_at_zero_under_earths_gravity_for_two_seconds(arm, tmp_
     assert not saved.v[0].any()
     again = vp.simulate(vp.Scene(load_robot(arm)), [0, 0], [0, 0], dt=1e-3, steps=2000)
     np.testing.assert_array_equal(saved.q, again.q)
+    # Or near it, where the step does not divide it.
+    run("simulate", arm, "--quiet", "--dt", "0.3", "--save", path)
+    assert vp.Trajectory.load(path).steps == 7
 
 
 def test_outputs_are_written_and_listed(arm, tmp_path, run):
@@ -122,6 +125,10 @@ MISTAKES = [
     ("replay SAVED --robot ARM --speed 0", "--speed"),
     ("simulate scene.toml --dt 0.1", ("--dt", "scene file")),
     ("simulate scene.toml --no-gravity", ("--no-gravity", "scene file")),
+    *(
+        (f"simulate scene.toml --{option} 1", (f"--{option}", "scene file"))
+        for option in ("q0", "v0", "damping", "friction", "stiffness", "rest", "torque", "steps", "tolerance")
+    ),
     ("inspect scene.toml --lock dip=0", ("--lock", "scene file")),
     ("inspect scene.toml --xacro-args a=1", ("--xacro-args", "scene file")),
     ("solve finger", "finger_tracking"),

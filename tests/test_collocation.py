@@ -198,7 +198,7 @@ UNSEEN = {
     "long chain, eliminated": (lambda: vp.Scene(vp.planar_chain(30)), 5e-4, True),
     "springs and dampers": (lambda: vp.Scene(vp.load_robot("ur5"), damping=0.5, stiffness=2.0, rest=0.1), 5e-4, True),
     "on a rail": (lambda: zoo.ZOO["cart"].scene, 5e-4, True),
-    "sliders on an arm": (lambda: zoo.ZOO["panda"].scene, 5e-3, False),
+    "sliders on an arm": (lambda: zoo.ZOO["panda"].scene, 5e-4, False),
     "friction": (lambda: vp.Scene(vp.planar_chain(3), forces=[vp.CoulombFriction(0.1)]), 5e-3, False),
 }
 

@@ -109,6 +109,8 @@ def test_what_robots_know_goes_along(arms):
     for what in ("effort_limit", "velocity_limit", "damping", "friction", "position_limits"):
         np.testing.assert_array_equal(getattr(both, what), np.hstack([getattr(robot, what) for robot in arms]))
     np.testing.assert_array_equal(both.posture("default")[:8], arms[0].posture("default"))
+    twice = vp.combine(arms[0], arms[0], prefixes=["a_", "b_"])
+    np.testing.assert_array_equal(twice.posture("default"), np.tile(arms[0].posture("default"), 2))
     np.testing.assert_array_equal(vp.Scene(both, damping=0).armature, [0.0] * 8 + [0.02] * 6)
     assert len(both.ties) == 1
 

@@ -416,6 +416,15 @@ def test_what_is_refused_in_the_task(load, make, facts):
         make(robot).bind(Points(np.zeros(2), 1.0, 2, 6, 6, robot=robot))
 
 
+def test_a_margin_is_at_most_half_of_the_range():
+    """In the middle of a range nothing is beyond its limits, however wide the margin; elsewhere the distance to it."""
+    scene = vp.Scene(vp.planar_chain(2), gravity=False)
+    barrier = vp.JointLimitBarrier(scene.robot, margin=5.0, limits=([-1.0, 0.0], [1.0, 3.0]))
+    for q, cost in (([0.0, 1.5], 0.0), ([0.2, 1.0], 0.2**2 + 0.5**2)):
+        problem = vp.OptimalControlProblem(scene, vp.Terminal(barrier), q, [0.0, 0.0], dt=0.1, steps=1)
+        assert vp.solve(problem, max_iterations=0).cost == pytest.approx(cost, abs=1e-12)
+
+
 def test_robots_that_are_others(load, tmp_path):
     robot = load("ur5")
     inertia = '<inertial><mass value="0"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'

@@ -227,6 +227,15 @@ def test_steps_within_an_interval_and_missing_samples(load):
     assert vp.kalman_filter(scene, log, q_noise=ENCODER, dt=0.3 * H).given.parts.tolist() == [4] * 40
 
 
+def test_a_joint_without_first_samples_begins_on_the_line_of_the_next_ones():
+    t = 0.01 * np.arange(20)
+    q = (0.3 + 0.5 * t)[:, None]
+    q[:5] = np.nan
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=0.0, noise=vp.AdditiveNoise(1e-3))
+    found = vp.kalman_filter(scene, vp.Log(t, q, np.zeros((20, 1))), q_noise=1e-4)
+    np.testing.assert_allclose([found.q[0, 0], found.v[0, 0]], [0.3, 0.5], rtol=1e-9)
+
+
 def test_without_samples_the_filter_is_the_motion_and_its_linearization():
     robot = vp.planar_chain(3)
     scene = vp.Scene(robot, noise=vp.AdditiveNoise(0.1))

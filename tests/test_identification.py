@@ -48,6 +48,13 @@ def test_deviations_are_those_of_many_logs():
     assert np.mean(off**2) == pytest.approx(1.0, abs=0.3)
 
 
+def test_residuals_beyond_the_noise_that_is_given_make_deviations_as_large():
+    told, known = (
+        vp.identify(start(), log(noise=5.0 * NOISE), NAMES, q_noise=size * NOISE, delay=0.0) for size in (1.0, 5.0)
+    )
+    np.testing.assert_allclose(told.deviations, known.deviations, rtol=0.1)
+
+
 def test_derivatives_of_what_is_minimized():
     # The covariance of a linear problem is that of its derivatives: against differences of the minimum.
     rows = []

@@ -50,6 +50,8 @@ def test_sound_arm_gives_no_warning_and_its_figures(tmp_path):
     assert (link.name, link.joint, link.mass) == ("link2", "joint2", 1.0)
     np.testing.assert_allclose(link.center, [0.5, 0.0, 0.0])
     np.testing.assert_allclose(link.moments, [0.001, 0.083, 0.083])
+    # Joints span all links together: 3 m to a centre of mass are plausible where six joints are 1 m apart.
+    assert inspect_robot(write_arm(tmp_path, *[ROD] * 5, inertial(1, 0.001, 0.083, 0.083, x=3.0))).warnings == ()
 
 
 @pytest.mark.parametrize(

@@ -135,15 +135,18 @@ def test_steps_solve_their_equation(tree):
     assert np.abs(M @ motion.v[1] - motion.p[1]).max() <= 1e-12 * (np.abs(M) @ np.abs(motion.v[1])).max()
 
 
-def test_the_branch_margin_is_the_least_ratio_of_pivots(tree):
-    """(G1) at the midpoint: of M - (h/2) F_v - h^2 reach L_qq / (1 - margin), with reach 1/4 and margin 1/2, and M."""
+@pytest.mark.parametrize("alpha", [0.5, 0.4])
+def test_the_branch_margin_is_the_least_ratio_of_pivots(tree, alpha):
+    """(G1): of M - (h/2) F_v + h skew (A + A') - h^2 reach L_qq / (1 - margin) and M, with a margin of 1/2."""
     scene, h = vp.Scene(tree, stiffness=0.3, damping=DAMPING, friction=0.0), 2e-3
     q, v = state_of(tree)
     # The pivots are those of the last factors, at a guess that is close once there are steps to extrapolate.
-    motion = vp.simulate(scene, q, v, dt=h, steps=8, integrator=vp.Midpoint(), check=False)
+    motion = vp.simulate(scene, q, v, dt=h, steps=8, integrator=vp.Midpoint(alpha), check=False)
     assert (motion.statistics.substeps == 1).all()
-    jet = jet_of(scene, 0.5 * (motion.q[-2] + motion.q[-1]), (motion.q[-1] - motion.q[-2]) / h)
-    C = jet.Lvv + 0.5 * h * DAMPING * np.eye(tree.dof) - 0.5 * h * h * jet.Lqq
+    v = (motion.q[-1] - motion.q[-2]) / h
+    jet = jet_of(scene, motion.q[-2] + alpha * h * v, v)
+    C = jet.Lvv + 0.5 * h * DAMPING * np.eye(tree.dof) - 2.0 * h * h * alpha * (1.0 - alpha) * jet.Lqq
+    C += h * (alpha - 0.5) * (jet.Lvq + jet.Lvq.T)
     # From the last coordinate to the first.
     pivots = [np.diag(np.linalg.cholesky(matrix[::-1, ::-1])) ** 2 for matrix in (C, jet.Lvv)]
     assert motion.statistics.branch_margin[-1] - 1.0 == pytest.approx(
@@ -153,9 +156,14 @@ def test_the_branch_margin_is_the_least_ratio_of_pivots(tree):
 
 @pytest.mark.parametrize("integrator", [vp.ExplicitEuler(), vp.SemiImplicitEuler()], ids=str)
 def test_accelerations_are_pinocchios(tree, integrator):
-    scene, u = vp.Scene(tree, damping=0.0, friction=0.0), np.cos(np.arange(tree.dof))
-    q, v = state_of(tree)
+    """And momenta and energies, which count the rotors, too."""
+    scene = vp.Scene(tree, damping=0.0, friction=0.0, forces=vp.Armature(0.3))
+    (q, v), u = state_of(tree), np.cos(np.arange(tree.dof))
     motion = vp.simulate(scene, q, v, dt=H, steps=1, controls=u, integrator=integrator, check=False)
+    for p, energy, *state in zip(motion.p, motion.energy, motion.q, motion.v, strict=True):
+        jet = jet_of(scene, *state)
+        np.testing.assert_allclose(p, jet.Lv, rtol=0, atol=1e-12 * (np.abs(jet.Lvv) @ np.abs(state[1])).max())
+        assert energy == pytest.approx(state[1] @ jet.Lv - jet.L, rel=1e-11)
     data, at, rates = tree.model.createData(), tree.configuration(q), tree.velocity(v)
     M = jet_of(scene, q, v).Lvv
     force = u - tree.velocity(np.eye(tree.dof)) @ pin.nonLinearEffects(tree.model, data, at, rates)

@@ -63,6 +63,15 @@ def swing(interpolation, dt, steps, **options):
     return vp.OptimalControlProblem(scene, cost, BEGIN, np.zeros(2), dt=dt, steps=steps, **options)
 
 
+def test_what_an_input_does_is_what_the_energy_changes_by():
+    """Also at the nodes, where the velocity of a joint on a line jumps."""
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=0.0, constraints=vp.KinematicInput("joint1"))
+    u = np.random.default_rng(0).normal(size=(10, 1))
+    motion = vp.simulate(scene, [0.0], [0.5], dt=0.1, steps=10, controls=u, check=False)
+    assert np.ptp(motion.energy) > 1.0
+    assert np.abs(motion.statistics.energy_defect).max() <= 1e-12 * motion.energy.max()
+
+
 @pytest.mark.parametrize(("interpolation", "dt", "steps"), [("linear", 0.02, 60), ("cubic", 0.08, 15)])
 def test_a_plan_by_hand_holds_on_the_continuous_system(interpolation, dt, steps):
     """Between nodes the joint moves on its lines or cubics, in substeps as well; feedback is that of the policy."""

@@ -2,6 +2,7 @@
 
 import logging
 import threading
+from itertools import product
 
 import numpy as np
 import pinocchio as pin
@@ -333,10 +334,11 @@ def test_closed_loops(name, kp, kd, steps, unstable):
 
 
 def test_policies():
-    for kd, unstable in ((50.0, False), (80.0, True)):
-        gains, goals = np.tile([[-1e3, -kd]], (100, 1, 1)), np.tile([1.0, 0.0], (100, 1))
-        policy = vp.LinearPolicy(np.zeros((100, 1)), gains, goals, on="velocity")
-        assert bool(told(run(ROD, [0], [0], policy, dt=1e-2, steps=100, integrator=vp.RungeKutta4()))) == unstable
+    on_v, on_p = ("velocity", 1.0, vp.RungeKutta4()), ("momentum", INERTIA, vp.Gauss(2))
+    for (kd, unstable), (on, unit, integrator) in product(((50.0, False), (80.0, True)), (on_v, on_p)):
+        gains, goals = np.tile([[-1e3, -kd / unit]], (100, 1, 1)), np.tile([1.0, 0.0], (100, 1))
+        policy = vp.LinearPolicy(np.zeros((100, 1)), gains, goals, on=on)
+        assert bool(told(run(ROD, [0], [0], policy, dt=1e-2, steps=100, integrator=integrator))) == unstable
     cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost([0.5, 0.3], 1e4) + vp.VelocityCost(1e2))
     plan = vp.solve(vp.OptimalControlProblem(TWO, cost, [0, 0], [0, 0], dt=1e-2, steps=100, integrator=vp.Gauss(2)))
     motion = run(TWO, [0.05, -0.03], [0, 0], plan.policy, dt=1e-2, steps=100, integrator=vp.Gauss(2))

@@ -243,6 +243,12 @@ def test_verification_tells_what_the_continuous_robot_violates():
     assert far.verify().open_loop_constraints[0].violation == pytest.approx(0.5, rel=0.1)
 
 
+def test_before_the_first_node_a_start_outside_is_no_violation():
+    plan = vp.solve(reach(vp.WithinJointLimits(TWO, ([0.01, -np.inf], np.inf)), between_nodes=True))
+    assert plan.violation <= 1e-9
+    assert plan.verify().violation < 1e-4
+
+
 def test_a_motion_with_feedback_that_runs_away_is_no_small_violation():
     seen = SMALL["held, speeds"].plan.verify()
     (own,) = seen.constraints
@@ -610,6 +616,21 @@ def test_distances_are_those_of_least_squares(points, made):
         else:
             assert found < -0.05 + 1e-6
     assert clear > 15
+
+
+def test_a_plane_is_the_same_with_a_normal_of_any_length():
+    planes = [vp.KeepInHalfSpace(TWO, "tip", [0.0, 0.0, -size], 1.5 * size) for size in (1.0, 2.0)]
+    below = [vp.solve(reach(plane), max_iterations=0).violation for plane in planes]
+    assert below[0] == pytest.approx(below[1], rel=1e-12)
+    assert below[0] > 0.1
+
+
+def test_links_that_overlap_at_rest_do_not_clear_each_other():
+    """Of three links in a row the outer ones are no neighbours: thick ones overlap at all angles, and have no pair."""
+    robot = vp.planar_chain(4)
+    for radius, pairs in ((0.05, 3), (0.6, 1)):
+        thick = {f"joint{k}": ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], radius) for k in range(1, 5)}
+        assert len(clearance(robot, [], itself=True, capsules=thick).pairs) == pairs
 
 
 def test_slopes_are_differences():

@@ -24,7 +24,7 @@ from chromium import (
     visit,
     wait_until,
 )
-from mechanisms import joint, link, write_urdf
+from mechanisms import joint, link, mimic, write_urdf
 from PIL import Image, ImageSequence
 from refusals import naming, refused, unnamed
 from selenium.webdriver.common.by import By
@@ -483,6 +483,17 @@ def test_every_joint_has_a_node_of_its_own(tmp_path):
     moved = [part["path"] for part in commands(page)[-1]["animations"]]
     assert len({str(path) for path in moved}) == len(moved) == 6
     assert not {"shapes", "notes"} & {path.split("/")[-2] for path in moved}
+
+
+def test_a_follower_is_where_its_leader_puts_it(tmp_path):
+    leads = link("one") + joint("first", "base", "one")
+    robot = vp.load_robot(
+        write_urdf(tmp_path, leads, link("two") + joint("second", "base", "two", inside=mimic("first", -2.0, 0.3)))
+    )
+    page = vp.replay(robot, [[0.1], [0.4]], dt=1.0, html=tmp_path / "a.html")
+    tracks, _ = animation(page)
+    found = {path.split("/")[-2].split()[-1]: values for (path, _), (_, values) in tracks.items()}
+    np.testing.assert_allclose(found["second"], [0.1, -0.5], atol=1e-12)
 
 
 # --- films -----------------------------------------------------------------------------------------------------------

@@ -72,6 +72,7 @@ def test_idle_fingers_are_left_out_and_the_answer_is_the_same(tmp_path):
         ({"gravity": "[0.0, 0.0, -9.81]"}, 16),  # pulls at all of them
         ({"more": '[[noise]]\ntype = "additive"\nintensity = { "joint_6.0" = 1e-3 }'}, 8),
         ({"more": '[[noise]]\ntype = "control"\nintensity = 1e-3'}, 4),  # nothing without controls
+        ({"more": '[[noise]]\ntype = "state"\nintensity = { "joint_6.0" = 1e-3 }\ncenter = 0.1'}, 8),
         ({"more": '[springs]\nstiffness = { "joint_6.0" = 1.0 }'}, 4),  # slack
         ({"more": '[springs]\nstiffness = { "joint_5.0" = 1.0 }'}, 8),  # not slack at 0.4
         ({"more": '[[cost]]\ntype = "frame_position"\nframe = "link_7.0"\ntarget = [0, 0, 0]'}, 8),

@@ -107,6 +107,8 @@ def test_everything_in_a_scene_arrives(tmp_path):
     assert dict(file.robot.locked) == {"dip": 0.2}
     np.testing.assert_array_equal(scene.actuation, [[2.0, 0.0], [0.0, 1.0]])
     np.testing.assert_array_equal(problem.control_limits, [[-0.25, -0.5], [0.25, 0.5]])
+    turned = loaded(tmp_path, changed("mcp = 2.0, pip", "mcp = -2.0, pip")).problem
+    np.testing.assert_array_equal(turned.control_limits, problem.control_limits)
     np.testing.assert_array_equal(file.q0, [0.5, 0.3])
     np.testing.assert_array_equal(file.v0, [0.1, 0.0])
     assert (problem.dt, problem.steps, problem.integrator) == (2e-3, 50, vp.Midpoint(alpha=0.5))
@@ -490,6 +492,7 @@ HEAD = "t, mcp, pip, dip"
         "t, mcp, pip\n0,1,2\n1,2,3\n",
         f"{HEAD}, mcp\n0,1,2,3,1\n1,2,3,4,2\n",
         f"{HEAD}\n0,1,2,3\n0.05,2,3,4\n",
+        f"{HEAD}\n0.05,1,2,3\n1,2,3,4\n",
         f"{HEAD}\n0,1,2,3\n1,2,4\n",
         f"{HEAD}\n0,1,2,3\n1,2,nan,4\n",
         f"{HEAD}\n1,1,2,3\n0,2,3,4\n",

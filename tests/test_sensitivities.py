@@ -41,9 +41,10 @@ def agree(found, wanted, within=1e-7):
     assert (off <= within * np.maximum(sizes, 1e-2 * sizes.max(axis=0)) + 1e-8).all(), (off / sizes).round(10)
 
 
-def shaken(scene, integrator, dt=5e-3, steps=40, q0=JOINTS, v0=0.5, size=0.3):
+def shaken(scene, integrator, dt=5e-3, steps=40, q0=JOINTS, v0=0.5, size=0.3, *, line=False):
     rng = np.random.default_rng(3)
-    u = size * rng.standard_normal((steps, scene.controls))
+    u = size * rng.standard_normal((steps + line, scene.controls))
+    u = vp.FirstOrderHold(u) if line else u
     start = {"q0": q0, "v0": np.full(scene.robot.dof, v0)}
     return lambda of: vp.simulate(of, **start, dt=dt, steps=steps, controls=u, integrator=integrator, check=False)
 
@@ -91,11 +92,12 @@ def test_derivatives_are_those_of_differences(integrator):
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.RungeKutta4()], ids=str)
-@pytest.mark.parametrize("effort", [np.inf, 5.0])
-def test_gains_of_servos(integrator, effort):
+@pytest.mark.parametrize(("effort", "line"), [(np.inf, False), (5.0, False), (np.inf, True)])
+def test_gains_of_servos(integrator, effort, line):
     servo = vp.PositionServo([100.0, 60.0, 10.0], [6.0, 3.0, 0.3], effort)
     scene = vp.Scene(vp.planar_chain(3), damping=0.1, forces=servo)
-    compare(scene, ["servo_stiffness", "servo_damping", "damping"], shaken(scene, integrator, q0=JOINTS[:3], size=0.1))
+    names = ["servo_stiffness", "servo_damping", "damping"]
+    compare(scene, names, shaken(scene, integrator, q0=JOINTS[:3], size=0.1, line=line))
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)], ids=str)

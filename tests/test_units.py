@@ -110,6 +110,12 @@ def test_forces_beyond_effort_limits_are_told_of_by_what_reaches_the_joint():
     assert not unnamed(told, "'joint1'", "9 N", "by up to 3", "t = 0.049 s")
 
 
+def test_the_effort_of_a_servo_is_its_drive_s_not_what_its_gains_ask_for():
+    scene = vp.Scene(arm(TURN), gravity=False, forces=vp.PositionServo(100.0, effort=12.0))
+    (told,) = about(moved(scene, [0.0], [0.0], controls=[5.0]), "effort limits")
+    assert told.value == pytest.approx(3.0)
+
+
 def test_plans_ensembles_and_controllers_tell_of_all_limits():
     scene = vp.Scene(arm(TURN), gravity=False)
     cost = vp.ControlCost(1e-6) + vp.Terminal(vp.TrackingCost([2.0], 1e3) + vp.VelocityCost(1.0))
