@@ -9,30 +9,14 @@ from findings import about
 from mechanisms import random_tree
 from oracles import Mechanism, slope
 from refusals import refused, unnamed
+from zoo import rough
 
 import varpin as vp
 from varpin.linearization import linearize_steps
 
 
-def friction_noise(n, strength):
-    """Fields F_i = c (1 + v_i^2 / 2 + q_i v_i) e_i, which depend on the velocity, with their derivatives."""
-
-    def diagonal(values):
-        out = np.zeros((n, n, n))
-        out[np.arange(n), np.arange(n), np.arange(n)] = values
-        return strength * out
-
-    return vp.CustomNoise(
-        field=lambda q, v, u: strength * np.diag(1.0 + 0.5 * v**2 + q * v),
-        processes=n,
-        dq=lambda q, v, u: diagonal(v),
-        dv=lambda q, v, u: diagonal(v + q),
-        check=True,
-    )
-
-
 def test_velocity_dependent_fields():
-    scene = vp.Scene(vp.load_robot("ur5"), damping=0.1, noise=friction_noise(6, 0.3))
+    scene = vp.Scene(vp.load_robot("ur5"), damping=0.1, noise=rough(6, 6, 0.3))
     q, v, u, e, other = np.random.default_rng(0).uniform(-1, 1, (5, 6))
     options = {"dt": 1e-3, "steps": 1, "controls": u, "integrator": vp.Midpoint(), "check": False}
     motion = vp.simulate(scene, q, v, increments=0, **options)
@@ -55,7 +39,7 @@ def test_velocity_dependent_fields():
 )
 def test_drift_at_rest_and_moving(integrator, speed):
     """Its derivative does not take the size of a step from a momentum or velocity that may be zero."""
-    scene = vp.Scene(vp.load_robot("ur5"), damping=0.1, noise=friction_noise(6, 0.3))
+    scene = vp.Scene(vp.load_robot("ur5"), damping=0.1, noise=rough(6, 6, 0.3))
     q, v, u = np.random.default_rng(0).uniform(-1, 1, (3, 6))
     # The check's step is in units of the largest momentum, which turns a light wrist by much more: at 5 rad/s too far.
     step = 2e-3 if speed == 5.0 else 5e-3
@@ -67,7 +51,7 @@ def test_drift_at_rest_and_moving(integrator, speed):
 @pytest.mark.parametrize("custom", [False, True])
 def test_noisy_motions_are_linearized_at_zero_noise(integrator, custom):
     """Each step of one as the step without noise from the same node: a split kick's second half at its end too."""
-    noise = friction_noise(6, 0.3) if custom else vp.StateNoise(1.0) + vp.ControlNoise(0.2)
+    noise = rough(6, 6, 0.3) if custom else vp.StateNoise(1.0) + vp.ControlNoise(0.2)
     scene = vp.Scene(vp.load_robot("ur5"), damping=0.1, noise=noise)
     q, v, u = np.random.default_rng(0).uniform(-1, 1, (3, 6))
     noisy = vp.simulate(scene, q, v, dt=1e-3, steps=4, controls=u, integrator=integrator, rng=1)
@@ -322,8 +306,8 @@ def test_another_scene_is_refused_by_what_differs(load, name, tmp_path):
             vp.linearize(one, motion_of(other))
 
 
-def test_another_function_is_refused_by_what_it_makes_of_the_first_step(load):
-    one, other = (vp.Scene(load("ur5"), forces=vp.CustomForce(lambda q, v, k=k: k * v)) for k in (-0.5, -0.6))
+def test_another_function_is_refused_by_what_it_makes_of_the_first_step():
+    one, other = (vp.Scene(vp.planar_chain(2), forces=vp.CustomForce(lambda q, v, k=k: k * v)) for k in (-0.5, -0.6))
     assert vp.linearize(one, motion_of(one)).steps == 5
     with refused(vp.InputError, "first step differs"):
         vp.linearize(other, motion_of(one))
