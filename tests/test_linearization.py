@@ -15,19 +15,22 @@ import varpin as vp
 from varpin.linearization import linearize_steps
 
 
-def test_velocity_dependent_fields():
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4()], ids=str)
+def test_velocity_dependent_fields(integrator):
     scene = vp.Scene(vp.load_robot("ur5"), damping=0.1, noise=rough(6, 6, 0.3))
     q, v, u, e, other = np.random.default_rng(0).uniform(-1, 1, (5, 6))
-    options = {"dt": 1e-3, "steps": 1, "controls": u, "integrator": vp.Midpoint(), "check": False}
+    options = {"dt": 1e-3, "steps": 1, "controls": u, "integrator": integrator, "check": False}
     motion = vp.simulate(scene, q, v, increments=0, **options)
-    lin, p = vp.linearize(scene, motion), motion.p[0]
+    lin, momenta = vp.linearize(scene, motion), integrator.variational
+    second = motion.p[0] if momenta else v
 
     def field(x):
-        speed = np.linalg.solve(Mechanism(scene).mass_matrix(x[:6]), x[6:])
-        return lin.K[0] @ scene.noise.fields(x[None, :6], speed[None], u[None], q).F[0]
+        M = Mechanism(scene).mass_matrix(x[:6])
+        F = scene.noise.fields(x[None, :6], (np.linalg.solve(M, x[6:]) if momenta else x[6:])[None], u[None], q).F[0]
+        return lin.J[0] @ (F if momenta else np.linalg.solve(M, F))
 
-    along = np.append(e, np.abs(p).max() * other)
-    found = slope(field, np.append(q, p), along, 1e-2)
+    along = np.append(e, np.abs(second).max() * other)
+    found = slope(field, np.append(q, second), along, 1e-2)
     np.testing.assert_allclose(lin.Gx[0] @ along, found, rtol=0, atol=1e-8 * np.abs(found).max())
 
 
