@@ -20,11 +20,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if config.getoption("--slow"):
-        return
-    for item in items:
-        if "slow" in item.keywords or item.nodeid in SLOW:
-            item.add_marker(pytest.mark.skip(reason="slow: give --slow to run it"))
+    config.unknown_slow = SLOW - {item.nodeid for item in items}
+    if not config.getoption("--slow"):
+        slow = {item for item in items if "slow" in item.keywords or item.nodeid in SLOW}
+        config.hook.pytest_deselected(items=list(slow))
+        items[:] = [item for item in items if item not in slow]
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

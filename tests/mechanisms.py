@@ -11,15 +11,24 @@ INERTIAL = (
     '<inertial><origin xyz="0.02 0.05 0.1" rpy="0.3 0.2 0.1"/><mass value="1.3"/>'
     '<inertia ixx="0.02" iyy="0.03" izz="0.025" ixy="0.001" ixz="0.002" iyz="0.003"/></inertial>'
 )
+PLACE = 'xyz="0.1 0.02 0.2" rpy="0.1 0.2 0.3"'
 
 
 def link(name: str, inertial: str = INERTIAL, extra: str = "") -> str:
     return f'<link name="{name}">{inertial}{extra}</link>\n'
 
 
-def joint(name: str, parent: str, child: str, kind: str = "revolute", axis: str = "0 1 0", inside: str = "") -> str:
+def joint(
+    name: str,
+    parent: str,
+    child: str,
+    kind: str = "revolute",
+    axis: str = "0 1 0",
+    inside: str = "",
+    place: str = PLACE,
+) -> str:
     return (
-        f'<joint name="{name}" type="{kind}"><origin xyz="0.1 0.02 0.2" rpy="0.1 0.2 0.3"/><parent link="{parent}"/>'
+        f'<joint name="{name}" type="{kind}"><origin {place}/><parent link="{parent}"/>'
         f'<child link="{child}"/><axis xyz="{axis}"/><limit effort="9" velocity="8" lower="-1" upper="1"/>{inside}'
         "</joint>\n"
     )

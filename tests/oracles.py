@@ -27,6 +27,11 @@ def slope(f: Callable[[np.ndarray], np.ndarray], x: np.ndarray, along: np.ndarra
     return sum(w * (f(x + k * size * along) - f(x - k * size * along)) for k, w in WEIGHTS.items()) / size
 
 
+def jacobian(f: Callable[[np.ndarray], np.ndarray], x: np.ndarray, size: float) -> np.ndarray:
+    """The derivative of f in each entry of x (n,) or of rows x (N, n), as a last axis, as :func:`slope` has it."""
+    return np.stack([slope(f, x, e, size) for e in np.eye(x.shape[-1])], axis=-1)
+
+
 def order_of(counts: Sequence[float], errors: Sequence[float]) -> float:
     """The order of convergence: minus the slope of log error over log count, by least squares."""
     return -float(np.polyfit(np.log(counts), np.log(errors), 1)[0])
@@ -517,7 +522,7 @@ def least_cost(problem: vp.OptimalControlProblem, start: np.ndarray) -> float:
     sides = [np.broadcast_to(side, start.shape).ravel() for side in problem.control_limits]
     found = minimize(
         lambda x: parts(x)[0], first, method="SLSQP", bounds=Bounds(*sides),
-        constraints=rules if problem.constraints else (), options={"maxiter": 200, "ftol": 1e-8},
+        constraints=rules if problem.constraints else (), options={"maxiter": 200, "ftol": 1e-8 * parts(first)[0]},
     )  # fmt: skip
     assert found.success, found.message
     return float(found.fun)

@@ -14,6 +14,7 @@ over_integrators = pytest.mark.parametrize("integrator", INTEGRATORS, ids=str)
 STEPS = {"dt": 5e-3, "steps": 40}
 CHAINS = [vp.load_robot(random_tree(seed, size, branching=False)) for seed, size in ((3, 3), (1, 1), (4, 4))]
 PLACES = [None, PLACE, PLACE.inverse()]
+ARMS = vp.load_robot("panda"), vp.load_robot("ur5", armature=0.02)
 
 
 def forest():
@@ -98,19 +99,14 @@ def test_in_halves():
         np.testing.assert_allclose(A.T @ J @ A, J, rtol=0, atol=1e-9 * np.abs(A).max() ** 2)
 
 
-@pytest.fixture(scope="module")
-def arms():
-    return vp.load_robot("panda"), vp.load_robot("ur5", armature=0.02)
-
-
-def test_what_robots_know_goes_along(arms):
-    both = vp.combine(*arms, placements=[PLACE, None])
-    assert both.joint_names == arms[0].joint_names + arms[1].joint_names
+def test_what_robots_know_goes_along():
+    both = vp.combine(*ARMS, placements=[PLACE, None])
+    assert both.joint_names == ARMS[0].joint_names + ARMS[1].joint_names
     for what in ("effort_limit", "velocity_limit", "damping", "friction", "position_limits"):
-        np.testing.assert_array_equal(getattr(both, what), np.hstack([getattr(robot, what) for robot in arms]))
-    np.testing.assert_array_equal(both.posture("default")[:8], arms[0].posture("default"))
-    twice = vp.combine(arms[0], arms[0], prefixes=["a_", "b_"])
-    np.testing.assert_array_equal(twice.posture("default"), np.tile(arms[0].posture("default"), 2))
+        np.testing.assert_array_equal(getattr(both, what), np.hstack([getattr(robot, what) for robot in ARMS]))
+    np.testing.assert_array_equal(both.posture("default")[:8], ARMS[0].posture("default"))
+    twice = vp.combine(ARMS[0], ARMS[0], prefixes=["a_", "b_"])
+    np.testing.assert_array_equal(twice.posture("default"), np.tile(ARMS[0].posture("default"), 2))
     np.testing.assert_array_equal(vp.Scene(both, damping=0).armature, [0.0] * 8 + [0.02] * 6)
     assert len(both.ties) == 1
 
@@ -130,11 +126,11 @@ def placed(model, shapes, q):
 
 
 @pytest.mark.slow
-def test_shapes_stand_where_the_parts_put_them(arms):
-    both, q = vp.combine(*arms, placements=[None, PLACE]), np.random.default_rng(1).normal(size=14)
+def test_shapes_stand_where_the_parts_put_them():
+    both, q = vp.combine(*ARMS, placements=[None, PLACE]), np.random.default_rng(1).normal(size=14)
     first, second = (
         placed(robot.model, geometry(robot), robot.configuration(own))
-        for robot, own in zip(arms, (q[:8], q[8:]), strict=True)
+        for robot, own in zip(ARMS, (q[:8], q[8:]), strict=True)
     )
     assert_placed(both, q, first | {name: PLACE * place for name, place in second.items()})
     shapes, missing = readable_geometry(both)
@@ -159,13 +155,13 @@ def test_shapes_of_a_wrapper_stand_as_in_the_unlocked_model(lock):
     assert_placed(robot, q[own], placed(model, shapes, whole.configuration(q)))
 
 
-def test_names_that_clash_get_a_prefix(arms):
-    arm = arms[1]
+def test_names_that_clash_get_a_prefix():
+    arm = ARMS[1]
     twins = vp.combine(arm, arm, placements=[None, PLACE], prefixes=["left_", "right_"])
     assert twins.joint_names == tuple(f"{side}_{name}" for side in ("left", "right") for name in arm.joint_names)
     assert vp.combine(arm, arm).joint_names[0] == "a_shoulder_pan_joint"
     assert vp.combine(arm, vp.load_robot("ur3")).joint_names[0] == "ur5_shoulder_pan_joint"
-    four = vp.combine(twins, arms[0], twins)
+    four = vp.combine(twins, ARMS[0], twins)
     assert four.dof == 32
     assert four.joint_names[0] == "a_left_shoulder_pan_joint"
     assert len(geometry(four).geometryObjects) == 4 * 7 + 11

@@ -41,7 +41,7 @@ def test_a_linear_quadratic_plan_is_optimal_and_so_is_its_feedback():
     cost = vp.TrackingCost(goal, [4.0, 2.0, 1.0]) + vp.VelocityCost([0.1, 0.2, 0.3]) + vp.ControlCost(0.05)
     cost += vp.Terminal(vp.TrackingCost(goal, [30.0, 10.0, 20.0]))
     problem = vp.OptimalControlProblem(
-        scene, cost, q0, v0, dt=0.05, steps=20, integrator=vp.Midpoint(), sampling="midpoint"
+        scene, cost, q0, v0, dt=0.125, steps=8, integrator=vp.Midpoint(), sampling="midpoint"
     )
     plan = vp.solve(problem, np.zeros(2), tolerance=1e-14)
     assert plan.status.converged

@@ -4,17 +4,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import zoo
-from oracles import Mechanism, off_constraints, placements, slope
+from oracles import Mechanism, jacobian, off_constraints, placements, slope
 from refusals import refused, unnamed
 from scipy.optimize import minimize
 
 import varpin as vp
 from varpin.mechanics.assembly import along_constraints, nearest
-
-
-def central(f, x, size=1e-3):
-    """Derivative of f in each entry of x, along the first axis."""
-    return np.array([slope(f, x, d, size) for d in np.eye(x.size)])
 
 
 def loop(name, **options):
@@ -51,35 +46,31 @@ KINDS = {
     "custom": vp.CustomConstraint(1, circle, circle_slope, circle_curvature),
     "custom without curvature": vp.CustomConstraint(1, circle, circle_slope),
 }
-
-
-@pytest.fixture(scope="module")
-def arm():
-    return vp.load_robot("ur5")
+ARM = zoo.robot("ur5")
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_rows_have_the_derivatives_of_their_values(arm, kind):
-    scene = vp.Scene(arm, constraints=KINDS[kind])
+def test_rows_have_the_derivatives_of_their_values(kind):
+    scene = vp.Scene(ARM, constraints=KINDS[kind])
     rng = np.random.default_rng(0)
     q, v = rng.normal(size=6), rng.normal(size=6)
     g, C = scene.constraint_values(q)
     assert len(g) == len(scene.constraint_labels)
-    np.testing.assert_allclose(C, central(lambda x: scene.constraint_values(x)[0], q).T, atol=1e-11)
+    np.testing.assert_allclose(C, jacobian(lambda x: scene.constraint_values(x)[0], q, 1e-3), atol=1e-11)
     weights = rng.normal(size=len(g))
     H, bent = scene.core.constraint_curvature(q, weights, v)
-    slopes = central(lambda x: scene.core.constraints(x[None])[2][0], q)  # [k, row, c]
-    np.testing.assert_allclose(H, np.einsum("r,krc->kc", weights, slopes), atol=1e-10)
-    np.testing.assert_allclose(bent, np.einsum("krc,c->rk", slopes, v), atol=1e-10)
+    slopes = jacobian(lambda x: scene.core.constraints(x[None])[2][0], q, 1e-3)  # [row, c, k]
+    np.testing.assert_allclose(H, np.einsum("r,rck->kc", weights, slopes), atol=1e-10)
+    np.testing.assert_allclose(bent, np.einsum("rck,c->rk", slopes, v), atol=1e-10)
 
 
-def test_rows_mean_what_pinocchio_says(arm):
+def test_rows_mean_what_pinocchio_says():
     q = np.random.default_rng(1).normal(size=6)
-    ((tool,), (upper,)) = (placements(arm, q[None], name) for name in ("tool0", "upper_arm_link"))
+    ((tool,), (upper,)) = (placements(ARM, q[None], name) for name in ("tool0", "upper_arm_link"))
     place = upper.act(np.array([0.1, 0.0, 0.2]))
 
     def value(kind):
-        return vp.Scene(arm, constraints=KINDS[kind]).constraint_values(q)[0]
+        return vp.Scene(ARM, constraints=KINDS[kind]).constraint_values(q)[0]
 
     np.testing.assert_allclose(value("point on point"), tool.translation - (0.1, 0.2, 0.3), atol=1e-14)
     normal = upper.rotation @ np.array([1.0, 2.0, 3.0]) / np.sqrt(14.0)
@@ -91,7 +82,7 @@ def test_rows_mean_what_pinocchio_says(arm):
     np.testing.assert_allclose(value("rod"), [(far**2 - 0.25) / 1.0], atol=1e-14)
     # A weld in the pose that the frames have holds.
     pose = upper.actInv(tool).homogeneous
-    weld = vp.Scene(arm, constraints=vp.FrameOnFrame("tool0", "upper_arm_link", pose))
+    weld = vp.Scene(ARM, constraints=vp.FrameOnFrame("tool0", "upper_arm_link", pose))
     np.testing.assert_allclose(weld.constraint_values(q)[0], 0.0, atol=1e-14)
 
 
@@ -111,9 +102,9 @@ def test_parts_of_a_step_are_under_their_own_torques():
         held = vp.OpenLoop(lambda t: shake(t) + at[:3] + at[3:] * t / 0.05)
         return vp.simulate(scene, q, v, dt=0.05, steps=1, integrator=tight, controls=held, check=False)
 
-    slopes = central(lambda at: np.append(moved(at).q[-1], moved(at).p[-1]), np.zeros(6), 1e-2)
-    np.testing.assert_allclose(lin.B[0], slopes[:3].T, atol=1e-8)
-    np.testing.assert_allclose(lin.ramp[0], slopes[3:].T, atol=1e-8)
+    slopes = jacobian(lambda at: np.append(moved(at).q[-1], moved(at).p[-1]), np.zeros(6), 1e-2)
+    np.testing.assert_allclose(lin.B[0], slopes[:, :3], atol=1e-8)
+    np.testing.assert_allclose(lin.ramp[0], slopes[:, 3:], atol=1e-8)
 
 
 def test_forces_are_those_of_the_index_reduced_equations():
@@ -271,7 +262,7 @@ def test_a_custom_constraint_that_raises_is_told_of():
     def late(q):
         return circle(q) if q[2] < 0.05 else [np.nan]
 
-    failing = vp.Scene(vp.planar_chain(3), constraints=vp.CustomConstraint(1, late, circle_slope))
+    failing = vp.Scene(vp.planar_chain(3), constraints=vp.CustomConstraint(1, late, circle_slope, circle_curvature))
     with refused(vp.ConstraintError, "CustomConstraint") as info:
         vp.simulate(failing, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], dt=1e-2, steps=50)
     assert info.value.trajectory.steps == info.value.step > 0

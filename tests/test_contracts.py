@@ -11,9 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import pinocchio as pin
 import pytest
 import zoo
-from oracles import Mechanism, Motion, assert_jet, exact, order_of, same, slope
+from oracles import Mechanism, Motion, assert_jet, exact, jacobian, order_of, same, slope
 
 import varpin as vp
 from varpin import wiener
@@ -263,7 +264,8 @@ def test_order(case, integrator, signal):
     own = oracle(case, signal, integrator.variational)
     sizes = np.ptp(own.q, axis=0).max(), np.abs(own.v).max(), np.abs(own.energy).max() + np.abs(own.work).max() + 1e-9
     counts, errors = [], []
-    finest = MOST[integrator.order] // (4 if case.name.startswith("custom") else 1)
+    # Steps that call Python take long.
+    finest = MOST[integrator.order] // (4 if case.name.startswith("custom") or signal in PATHS else 1)
     for parts in finest * 2 ** np.arange(6) // 8 if finest > 7 else 2 ** np.arange(5):
         motion = motion_of(case, integrator, signal, parts)
         if motion.statistics.split_steps:
@@ -289,11 +291,12 @@ def test_order(case, integrator, signal):
         assert error[-1] < (1e-2 if integrator.order == 1 else 1e-4), (name, counts, error)
 
 
-@pytest.mark.parametrize("signal", [SIGNALS[0], *SIGNALS[3:]], ids=lambda signal: signal.name)
-@pytest.mark.parametrize("name", [*SILENT[::5], "stops", "servos", "frame springs"])
-def test_reference(name, signal):
-    case = zoo.ZOO[name]
-    own, motion = oracle(case, signal, False), motion_of(case, vp.Reference(1e-11), signal, 1)
+@pytest.mark.parametrize(
+    ("case", "integrator", "signal"),
+    combined([*SILENT[::5], "stops", "servos"], 6 * [vp.Reference(1e-11)], SIGNALS[:1] + SIGNALS[3:], 2),
+)
+def test_reference(case, integrator, signal):
+    own, motion = oracle(case, signal, False), motion_of(case, integrator, signal, 1)
     np.testing.assert_allclose(motion.q, own.q, rtol=0, atol=2e-9)
     np.testing.assert_allclose(motion.v, own.v, rtol=0, atol=2e-8 * np.abs(own.v).max())
 
@@ -357,6 +360,16 @@ def test_jet(name):
     assert_jet(case.scene, case.q0, case.v0, "compiled")
     with contextlib.suppress(vp.InputError):  # of what Pinocchio does not know
         assert_jet(case.scene, case.q0, case.v0, "pinocchio")
+
+
+@pytest.mark.parametrize("name", [*CONSERVATIVE, "tilted chain"])
+def test_holding_torque(name):
+    """Pinocchio's gravity, less the pull of springs."""
+    case = zoo.ZOO[name]
+    own, none = Mechanism(case.scene), np.zeros(case.q0.size)
+    weight = own.G.T @ pin.computeGeneralizedGravity(own.model, own.data, own.positions(case.q0))
+    expected = weight - own.forces(case.q0, none, none)[1]
+    np.testing.assert_allclose(case.scene.holding_torque(case.q0), expected, rtol=1e-12, atol=1e-13)
 
 
 @pytest.mark.parametrize("alpha", [0.5, 0.2])
@@ -594,9 +607,8 @@ def test_kicks_along_lines(integrator):
     F = fields(case, q, 0.5 * (before + after))
     sloped = (fields(case, q, after) - fields(case, q, before))[:, :m] / np.sqrt(12.0)
     np.testing.assert_allclose(lin.G[-1], lin.K[-1] @ np.hstack([F, sloped]), rtol=0, atol=1e-12)
-    for i, e in enumerate(np.eye(F.shape[1] + m)):
-        found = slope(lambda dw: step.of(np.append(step.x, step.u), dw), np.zeros(e.size), e, 5e-3)
-        np.testing.assert_allclose(lin.G[-1][:, i], found, rtol=0, atol=1e-9)
+    found = jacobian(lambda dw: step.of(np.append(step.x, step.u), dw), np.zeros(F.shape[1] + m), 5e-3)
+    np.testing.assert_allclose(lin.G[-1], found, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", NOISY)

@@ -5,7 +5,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from oracles import Mechanism, placements, slope
+from oracles import Mechanism, jacobian, placements
 from plan_problems import linear, small
 from refusals import refused
 from scipy.interpolate import CubicHermiteSpline
@@ -53,11 +53,6 @@ def plain(residual, J, weight, columns, size):
     return np.einsum("Nr,rs,Ns->N", residual, weight, residual), gradient, hessian
 
 
-def slopes_in_q(function, q):
-    """Derivative (N, ..., n) of a function of q (N, n)."""
-    return np.stack([slope(function, q, e, 1e-2) for e in np.eye(q.shape[1])], axis=-1)
-
-
 def masses(robot, q):
     """Centres of mass (N, 3) and their derivatives (N, 3, n), by Pinocchio."""
     model, gear = robot.model, robot.velocity(np.eye(robot.dof)).T
@@ -89,7 +84,7 @@ def terms(rng, robot, frame, q, v, u):
     of_turn = turn @ np.swapaxes(R, 1, 2) @ J[:, 3:]
     add(vp.FrameOrientationCost(robot, frame, turns, W), W, error, of_turn, slice(0, n))
     W, twist = spd(rng, 6), rng.normal(size=(N, 6))
-    in_q = slopes_in_q(lambda q: (kinematics.jacobians(q)[2] @ v[:, :, None])[..., 0], q)
+    in_q = jacobian(lambda q: (kinematics.jacobians(q)[2] @ v[:, :, None])[..., 0], q, 1e-2)
     slopes = np.concatenate([in_q, J], axis=2)
     add(vp.FrameVelocityCost(robot, frame, twist, W), W, (J @ v[:, :, None])[..., 0] - twist, slopes, slice(0, 2 * n))
     W, place = spd(rng, 3), rng.normal(size=(N, 3))
@@ -104,7 +99,7 @@ def terms(rng, robot, frame, q, v, u):
     J = chosen(q)
     measured = np.sqrt(np.linalg.det(J @ np.swapaxes(J, 1, 2)))
     least = 1.01 * float(np.median(measured))
-    slopes = measured[:, None] * np.einsum("Nar,Nrab->Nb", np.linalg.pinv(J), slopes_in_q(chosen, q))
+    slopes = measured[:, None] * np.einsum("Nar,Nrab->Nb", np.linalg.pinv(J), jacobian(chosen, q, 1e-2))
     slopes = np.where(measured < least, -1.0, 0.0)[:, None, None] * slopes[:, None]
     cost = vp.ManipulabilityCost(robot, frame, least, 1.7, ["xyz"[row] for row in rows])
     add(cost, np.array([[1.7]]), np.maximum(0.0, least - measured)[:, None], slopes, slice(0, n))
@@ -159,7 +154,7 @@ def test_manipulability_where_there_is_none(load):
     q = np.array([straight, wrist, straight * [1, 1, 1, 1, 0, 1]])
     bound = vp.ManipulabilityCost(robot, "tool0", 0.05).bind(Points(np.zeros(3), 1.0, 2, 6, 6))
     given = bound.expand(q, q, q)
-    slopes = slopes_in_q(lambda q: np.linalg.det(frame.jacobians(q)[2]), q)
+    slopes = jacobian(lambda q: np.linalg.det(frame.jacobians(q)[2]), q, 1e-2)
     assert (np.abs(slopes[:2]).max(axis=1) > 1e-3).all()
     assert_allclose(np.abs(given.gradient[:, :6]), 0.1 * np.abs(slopes), atol=1e-10)
     assert_allclose(given.gradient[2], 0.0, atol=1e-10)

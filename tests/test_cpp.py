@@ -60,7 +60,7 @@ def test_headers_stand_beside_each_other(tmp_path):
 def test_arithmetic_that_is_not_exact_is_refused(tmp_path):
     source = tmp_path / "fast.cpp"
     source.write_text('#include "varpin/variational.hpp"\n')
-    command = [COMPILER, *FLAGS, "-ffast-math", "-fsyntax-only", source]
+    command = [COMPILER, *FLAGS, "-ffast-math", "-fsyntax-only", "-Wfatal-errors", source]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert "IEEE" in done.stderr

@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from findings import about
+from oracles import same
 from refusals import naming, refused
 
 import varpin as vp
@@ -45,15 +46,8 @@ def same_paths(some, whole):
     """The paths of an ensemble are the first ones of another, to the last bit."""
     for name in ARRAYS:
         mine, other = getattr(some, name), getattr(whole, name)
-        assert (mine is None) == (other is None)
-        assert mine is None or mine.tobytes() == other[: len(mine)].tobytes()
-    assert some.t.tobytes() == whole.t.tobytes()
-
-
-def same_ensembles(one, other):
-    same_statistics(one, other)
-    same_paths(one, other)
-    assert (one.failures, one.warnings) == (other.failures, other.warnings)
+        assert same(mine, other if mine is None else other[: len(mine)]), name
+    assert same(some.t, whole.t)
 
 
 @pytest.mark.parametrize("kick", ["left", "split"])
@@ -63,7 +57,7 @@ def test_same_bytes_for_any_number_of_workers(kick):
     seven = run(paths=200, workers=7, integrator=integrator, progress=lambda *done: calls.append(done))
     assert calls == [(96, 200), (192, 200), (200, 200)]
     for other in (two, seven):
-        same_ensembles(other, one)
+        assert same(other, one)
 
 
 def test_a_few_long_paths_are_work_for_four():
@@ -333,7 +327,7 @@ def test_a_file_gives_the_ensemble_back(store, tmp_path):
     again = vp.Ensemble.load(path)
     assert found.failures
     assert str(again) == str(found)
-    same_ensembles(again, found)
+    assert same(again, found)
     with np.load(path) as members:
         np.savez(path, **dict(members) | {"t": np.zeros(3)})
     with pytest.raises(vp.FileError, match="instead of float64"):
@@ -343,16 +337,13 @@ def test_a_file_gives_the_ensemble_back(store, tmp_path):
 # --- on other processes and machines: the bytes of threads, and little on the way ------------------------------------
 
 
-@pytest.fixture(scope="module", params=["fork", "spawn"])
+@pytest.fixture(scope="module", params=["spawn", "fork"])
 def pool(request):
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context(request.param)) as opened:
         yield opened
 
 
-@pytest.fixture(scope="module")
-def spawned():
-    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as opened:
-        yield opened
+spawned = pytest.mark.parametrize("pool", ["spawn"], indirect=True)
 
 
 class Shipping(Executor):
@@ -377,19 +368,19 @@ def test_processes_give_the_bytes_of_threads(pool, store):
     threads = run(paths=300, store=store, workers=3)
     rng = np.random.default_rng(7)
     options = {"executor": pool, "rng": rng, "progress": lambda *done: calls.append(done)}
-    same_ensembles(run(paths=300, store=store, **options), threads)
+    assert same(run(paths=300, store=store, **options), threads)
     assert calls[-1] == (300, 300)
     assert rng.spawn(1)[0].random() == np.random.default_rng(7).spawn(301)[300].random()
     assert len(calls) > 2
     with ThreadPoolExecutor(2) as other:
-        same_ensembles(run(paths=300, store=store, executor=other), threads)
+        assert same(run(paths=300, store=store, executor=other), threads)
 
 
 def test_nothing_comes_back_that_was_not_asked_for():
     shipping = Shipping()
     paths, steps = 2000, 50
     end = run(paths=paths, steps=steps, store=False, quantiles=(), executor=shipping)
-    same_ensembles(end, run(paths=paths, steps=steps, store=False, quantiles=()))
+    assert same(end, run(paths=paths, steps=steps, store=False, quantiles=()))
     numbers = (steps + 1) * (1 + 5 + 25)
     assert shipping.sent >= 10
     assert shipping.returned < shipping.sent * (8 * numbers + 5000) + 8 * paths
@@ -418,10 +409,11 @@ def plan_of(scene, start=(0.0, 0.0), goal=(0.5, 0.2), **grid):
     return vp.solve(vp.OptimalControlProblem(scene, cost, start, [0.0, 0.0], **given), max_iterations=2)
 
 
-def test_monte_carlo_on_processes(spawned):
+@spawned
+def test_monte_carlo_on_processes(pool):
     plan = plan_of(make_scene())
     calls = []
-    found = plan.monte_carlo(300, 1, executor=spawned, progress=lambda *done: calls.append(done))
+    found = plan.monte_carlo(300, 1, executor=pool, progress=lambda *done: calls.append(done))
     assert found == plan.monte_carlo(300, 1, workers=2) == plan.monte_carlo(300, 1, workers=1)
     assert calls[-1] == (300, 300)
     shipping = Shipping()
@@ -429,9 +421,10 @@ def test_monte_carlo_on_processes(spawned):
     assert shipping.returned < 300 * 8 + 3000 * shipping.sent
 
 
-def test_references_in_place_are_sampled_before_they_are_sent(spawned):
+@spawned
+def test_references_in_place_are_sampled_before_they_are_sent(pool):
     plan = plan_of(make_scene(), goal=lambda t: [0.1 * t, 0.0])
-    assert plan.monte_carlo(50, 1, executor=spawned) == plan.monte_carlo(50, 1)
+    assert plan.monte_carlo(50, 1, executor=pool) == plan.monte_carlo(50, 1)
 
 
 def test_monte_carlo_tells_of_what_its_paths_do(caplog):
@@ -481,9 +474,10 @@ def test_paths_that_were_finished_before_a_worker_was_lost_are_kept():
     assert pickle.loads(pickle.dumps(caught.value)).result.q.shape == kept.q.shape
 
 
-def test_workers_or_executor(spawned):
+@spawned
+def test_workers_or_executor(pool):
     with refused(vp.InputError, "executor", "workers"):
-        run(workers=2, executor=spawned)
+        run(workers=2, executor=pool)
     with refused(vp.InputError, "executor", "int"):
         run(executor=4)
     with executing(None, 2) as own:
@@ -499,7 +493,7 @@ def test_a_dask_cluster_gives_the_bytes_of_threads():
         distributed.Client(cluster) as client,
     ):
         executor = client.get_executor()
-        same_ensembles(run(paths=300, executor=executor), run(paths=300))
+        assert same(run(paths=300, executor=executor), run(paths=300))
         assert plan.monte_carlo(100, 1, executor=executor) == plan.monte_carlo(100, 1)
         killed = []
 
@@ -510,7 +504,7 @@ def test_a_dask_cluster_gives_the_bytes_of_threads():
 
         end = run(paths=3000, store=False, executor=executor, progress=kill)
     assert killed
-    same_ensembles(end, run(paths=3000, store=False))
+    assert same(end, run(paths=3000, store=False))
 
 
 @pytest.mark.slow
@@ -538,10 +532,11 @@ def failing(task):
     return task
 
 
-def test_what_work_raises_comes_back(spawned):
-    results = in_order(spawned, failing, range(5))
+@spawned
+def test_what_work_raises_comes_back(pool):
+    results = in_order(pool, failing, range(5))
     assert [next(results), next(results)] == [0, 1]
     with refused(vp.UnknownJoint, "elbow"):
         next(results)
     # The pool is as good as before.
-    assert list(in_order(spawned, abs, [-1, 2])) == [1, 2]
+    assert list(in_order(pool, abs, [-1, 2])) == [1, 2]

@@ -104,15 +104,7 @@ def test_plans_come_to_sharp_friction_from_wide_friction(name):
     # Wider friction is no stronger at any speed.
     assert 0.97 * wide.cost < plan.cost < 1.1 * wide.cost
     # The goal is reached in steps of a tenth, too, which resolve the friction better.
-    fine = vp.simulate(
-        sharp.scene,
-        sharp.q0,
-        sharp.v0,
-        dt=2e-3,
-        steps=500,
-        controls=np.repeat(plan.controls, 10, axis=0),
-        integrator=vp.Radau(3),
-    )
+    fine = sharp.at(dt=2e-3, hold=10, integrator=vp.Radau(3)).simulate(np.repeat(plan.controls, 10, axis=0))
     assert np.abs(fine.q[-1] - plan.trajectory.q[-1]).max() < 0.05
 
 

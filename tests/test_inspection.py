@@ -14,7 +14,6 @@ import varpin as vp
 from varpin.show.inspection import inspect_robot
 
 ROD = '<mass value="1"/><origin xyz="0.5 0 0"/><inertia ixx="0.001" ixy="0" ixz="0" iyy="0.083" iyz="0" izz="0.083"/>'
-LIMIT = '<limit lower="-1" upper="2" effort="10" velocity="3"/>'
 ODD = "non-physical inertia"
 
 
@@ -25,17 +24,14 @@ def inertial(mass: float, ixx: float, iyy: float, izz: float, x: float = 0.5) ->
     )
 
 
-def write_arm(folder: Path, *links: str | None, extra: str = "", joint: str = LIMIT) -> Path:
+def write_arm(folder: Path, *links: str | None) -> Path:
     """A URDF of links link1, link2, ... in a row, 1 m apart on joints joint1, joint2, ... about y."""
-    text = '<link name="base"/>'
-    for k, link in enumerate(links, start=1):
-        body = "" if link is None else f"<inertial>{link}</inertial>"
-        text += f'<link name="link{k}">{body}</link><joint name="joint{k}" type="revolute">'
-        text += f'<parent link="{"base" if k == 1 else f"link{k - 1}"}"/><child link="link{k}"/>'
-        text += f'<origin xyz="{0 if k == 1 else 1} 0 0"/><axis xyz="0 1 0"/>{joint}</joint>'
-    path = folder / "arm.urdf"
-    path.write_text(f'<robot name="arm">{text}{extra}</robot>')
-    return path
+    parts, before, place = [], "base", 'xyz="0 0 0"'
+    for k, own in enumerate(links, start=1):
+        parts.append(mechanisms.link(f"link{k}", "" if own is None else f"<inertial>{own}</inertial>"))
+        parts.append(mechanisms.joint(f"joint{k}", before, f"link{k}", place=place))
+        before, place = f"link{k}", 'xyz="1 0 0"'
+    return mechanisms.write_urdf(folder, *parts)
 
 
 def test_sound_arm_gives_no_warning_and_its_figures(tmp_path):
@@ -44,7 +40,7 @@ def test_sound_arm_gives_no_warning_and_its_figures(tmp_path):
     assert report.total_mass == pytest.approx(2.0)
     first = report.joints[0]
     assert (first.name, first.kind, first.unit) == ("joint1", "revolute", "rad")
-    assert (first.lower, first.upper, first.effort, first.velocity) == (-1.0, 2.0, 10.0, 3.0)
+    assert (first.lower, first.upper, first.effort, first.velocity) == (-1.0, 1.0, 9.0, 8.0)
     np.testing.assert_allclose(first.axis, [0.0, 1.0, 0.0])
     link = report.links[1]
     assert (link.name, link.joint, link.mass) == ("link2", "joint2", 1.0)
@@ -111,7 +107,7 @@ def test_condition_number_is_that_of_the_mass_matrix():
 def test_ill_conditioned_mass_matrix_is_said(tmp_path):
     """Two joints on one axis: only the first link's own inertia tells them apart."""
     path = write_arm(tmp_path, inertial(1e-3, 1e-7, 1e-7, 1e-7, x=0), inertial(1, 0.01, 0.5, 0.5))
-    path.write_text(path.read_text().replace('<origin xyz="1 0 0"/><axis', '<origin xyz="0 0 0"/><axis'))
+    path.write_text(path.read_text().replace('<origin xyz="1 0 0"/><parent', '<origin xyz="0 0 0"/><parent'))
     report = inspect_robot(path)
     assert naming(report.warnings, "mass matrix", "ill-conditioned")
     # M = [[I + e, I], [I, I]] with I = 0.75 and e = 1e-7.

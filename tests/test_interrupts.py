@@ -89,7 +89,7 @@ def test_the_first_is_answered_at_once_and_keeps_the_run(tmp_path):
 
 def test_the_first_while_writing_finishes_the_file(tmp_path):
     path, figure = tmp_path / "a.npz", tmp_path / "a.png"
-    command = Command(*SHORT, "--save", str(path), "--plot", str(figure), save=2.0)
+    command = Command(*SHORT, "--save", str(path), "--plot", str(figure), save=1.0)
     command.wait_for("WRITING")
     command.interrupt()
     assert command.end() == 130

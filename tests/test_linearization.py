@@ -9,41 +9,28 @@ from findings import about
 from mechanisms import random_tree
 from oracles import Mechanism, slope
 from refusals import refused, unnamed
+from zoo import rough
 
 import varpin as vp
 from varpin.linearization import linearize_steps
 
 
-def friction_noise(n, strength):
-    """Fields F_i = c (1 + v_i^2 / 2 + q_i v_i) e_i, which depend on the velocity, with their derivatives."""
-
-    def diagonal(values):
-        out = np.zeros((n, n, n))
-        out[np.arange(n), np.arange(n), np.arange(n)] = values
-        return strength * out
-
-    return vp.CustomNoise(
-        field=lambda q, v, u: strength * np.diag(1.0 + 0.5 * v**2 + q * v),
-        processes=n,
-        dq=lambda q, v, u: diagonal(v),
-        dv=lambda q, v, u: diagonal(v + q),
-        check=True,
-    )
-
-
-def test_velocity_dependent_fields():
-    scene = vp.Scene(vp.load_robot("ur5"), damping=0.1, noise=friction_noise(6, 0.3))
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4()], ids=str)
+def test_velocity_dependent_fields(integrator):
+    scene = vp.Scene(vp.load_robot("ur5"), damping=0.1, noise=rough(6, 6, 0.3))
     q, v, u, e, other = np.random.default_rng(0).uniform(-1, 1, (5, 6))
-    options = {"dt": 1e-3, "steps": 1, "controls": u, "integrator": vp.Midpoint(), "check": False}
+    options = {"dt": 1e-3, "steps": 1, "controls": u, "integrator": integrator, "check": False}
     motion = vp.simulate(scene, q, v, increments=0, **options)
-    lin, p = vp.linearize(scene, motion), motion.p[0]
+    lin, momenta = vp.linearize(scene, motion), integrator.variational
+    second = motion.p[0] if momenta else v
 
     def field(x):
-        speed = np.linalg.solve(Mechanism(scene).mass_matrix(x[:6]), x[6:])
-        return lin.K[0] @ scene.noise.fields(x[None, :6], speed[None], u[None], q).F[0]
+        M = Mechanism(scene).mass_matrix(x[:6])
+        F = scene.noise.fields(x[None, :6], (np.linalg.solve(M, x[6:]) if momenta else x[6:])[None], u[None], q).F[0]
+        return lin.J[0] @ (F if momenta else np.linalg.solve(M, F))
 
-    along = np.append(e, np.abs(p).max() * other)
-    found = slope(field, np.append(q, p), along, 1e-2)
+    along = np.append(e, np.abs(second).max() * other)
+    found = slope(field, np.append(q, second), along, 1e-2)
     np.testing.assert_allclose(lin.Gx[0] @ along, found, rtol=0, atol=1e-8 * np.abs(found).max())
 
 
@@ -55,7 +42,7 @@ def test_velocity_dependent_fields():
 )
 def test_drift_at_rest_and_moving(integrator, speed):
     """Its derivative does not take the size of a step from a momentum or velocity that may be zero."""
-    scene = vp.Scene(vp.load_robot("ur5"), damping=0.1, noise=friction_noise(6, 0.3))
+    scene = vp.Scene(vp.load_robot("ur5"), damping=0.1, noise=rough(6, 6, 0.3))
     q, v, u = np.random.default_rng(0).uniform(-1, 1, (3, 6))
     # The check's step is in units of the largest momentum, which turns a light wrist by much more: at 5 rad/s too far.
     step = 2e-3 if speed == 5.0 else 5e-3
@@ -67,7 +54,7 @@ def test_drift_at_rest_and_moving(integrator, speed):
 @pytest.mark.parametrize("custom", [False, True])
 def test_noisy_motions_are_linearized_at_zero_noise(integrator, custom):
     """Each step of one as the step without noise from the same node: a split kick's second half at its end too."""
-    noise = friction_noise(6, 0.3) if custom else vp.StateNoise(1.0) + vp.ControlNoise(0.2)
+    noise = rough(6, 6, 0.3) if custom else vp.StateNoise(1.0) + vp.ControlNoise(0.2)
     scene = vp.Scene(vp.load_robot("ur5"), damping=0.1, noise=noise)
     q, v, u = np.random.default_rng(0).uniform(-1, 1, (3, 6))
     noisy = vp.simulate(scene, q, v, dt=1e-3, steps=4, controls=u, integrator=integrator, rng=1)
@@ -322,8 +309,8 @@ def test_another_scene_is_refused_by_what_differs(load, name, tmp_path):
             vp.linearize(one, motion_of(other))
 
 
-def test_another_function_is_refused_by_what_it_makes_of_the_first_step(load):
-    one, other = (vp.Scene(load("ur5"), forces=vp.CustomForce(lambda q, v, k=k: k * v)) for k in (-0.5, -0.6))
+def test_another_function_is_refused_by_what_it_makes_of_the_first_step():
+    one, other = (vp.Scene(vp.planar_chain(2), forces=vp.CustomForce(lambda q, v, k=k: k * v)) for k in (-0.5, -0.6))
     assert vp.linearize(one, motion_of(one)).steps == 5
     with refused(vp.InputError, "first step differs"):
         vp.linearize(other, motion_of(one))

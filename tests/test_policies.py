@@ -243,16 +243,11 @@ def test_sums_scales_and_words():
 # --- that change within a step: their values and means, steps in parts, functions of time ----------------------------
 
 
-UR5_Q = np.array([0.3, -1.2, 0.8, 0.2, 0.5, -0.3])
+ARM, UR5_Q = vp.Scene(vp.load_robot("ur5")), np.array([0.3, -1.2, 0.8, 0.2, 0.5, -0.3])
 
 
 def force(t):
     return np.array([40.0, 60.0, 30.0, 5.0, 4.0, 3.0]) * np.sin(np.arange(3.0, 9.0) * t + np.arange(6))
-
-
-@pytest.fixture(scope="module")
-def arm():
-    return vp.Scene(vp.load_robot("ur5"))
 
 
 def moments(force, begin, dt):
@@ -266,9 +261,9 @@ HELD = [vp.Midpoint(), vp.Gauss(1), vp.Radau(1), vp.ExplicitEuler()]
 
 
 @pytest.mark.parametrize("integrator", [*HELD, vp.Gauss(3), vp.Radau(2), vp.RungeKutta4()], ids=str)
-def test_values_and_means(arm, integrator):
+def test_values_and_means(integrator):
     """One stage holds the mean; the values at several have the moments of the function."""
-    motion = vp.simulate(arm, UR5_Q, np.zeros(6), dt=0.01, steps=6, controls=vp.OpenLoop(force), integrator=integrator)
+    motion = vp.simulate(ARM, UR5_Q, np.zeros(6), dt=0.01, steps=6, controls=vp.OpenLoop(force), integrator=integrator)
     times = np.zeros(0) if integrator in HELD else 2.0 * np.array(integrator.stage_times) - 1.0
     for k in range(6):
         of_force = moments(force, 0.01 * k, 0.01)

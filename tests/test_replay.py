@@ -40,20 +40,17 @@ from varpin.show.replay import page as page_module
 from varpin.show.replay import shapes as shape_module
 from varpin.show.replay.picture import Picture
 
-
-@pytest.fixture(scope="module")
-def finger():
-    return vp.load_robot("finger")
+FINGER = vp.load_robot("finger")
 
 
 @pytest.fixture(scope="module")
-def motion(finger):
-    scene = vp.Scene(finger, gravity=False, stiffness=[0.54, 0.28, 0.12], damping=[3.1e-3, 2.2e-3, 0.9e-3])
+def motion():
+    scene = vp.Scene(FINGER, gravity=False, stiffness=[0.54, 0.28, 0.12], damping=[3.1e-3, 2.2e-3, 0.9e-3])
     return vp.simulate(scene, q0=[0.9, 1.2, 0.8], v0=[0.0, 0.0, 0.0], dt=1e-3, steps=500)
 
 
-def test_page_plays_offline_and_shows_the_finger_large(show, browser, finger, motion):
-    assert ">loading<" in show(finger, motion).read_text()
+def test_page_plays_offline_and_shows_the_finger_large(show, browser, motion):
+    assert ">loading<" in show(FINGER, motion).read_text()
     assert browser.execute_script("return viewer.animator.playing")
     assert browser.find_elements(By.ID, "loading") == []
 
@@ -103,9 +100,9 @@ def test_page_poses_every_shape_as_pinocchio_does(show, browser, name):
 
 
 @pytest.mark.parametrize(("dt", "steps", "speed"), [(1e-4, 3000, 1.0), (1e-4, 7, 1.0), (2e-2, 40, 0.1), (0.7, 3, 1.0)])
-def test_duration_is_the_motions(show, browser, finger, dt, steps, speed):
+def test_duration_is_the_motions(show, browser, dt, steps, speed):
     q, duration = np.linspace([0.0, 0.0, 0.0], [1.0, 0.5, 0.2], steps + 1), steps * dt / speed
-    path = show(finger, q, dt=dt, speed=speed)
+    path = show(FINGER, q, dt=dt, speed=speed)
     assert browser.execute_script("return viewer.animator.duration") == pytest.approx(duration, rel=1e-6)
     tracks, options = animation(path)
     assert options == {"play": True, "repetitions": float("inf")}
@@ -126,8 +123,8 @@ def bar(browser):
     )
 
 
-def test_the_bar_plays_pauses_and_goes_to_a_time(show, browser, finger):
-    show(finger, np.linspace([0.1, 0.2, 0.3], [0.9, 0.8, 0.7], 21), dt=0.1, speed=0.5)
+def test_the_bar_plays_pauses_and_goes_to_a_time(show, browser):
+    show(FINGER, np.linspace([0.1, 0.2, 0.3], [0.9, 0.8, 0.7], 21), dt=0.1, speed=0.5)
     assert bar(browser)[1:] == [2.0, True]
     browser.find_element(By.ID, "play").click()
     paused = bar(browser)
@@ -138,7 +135,7 @@ def test_the_bar_plays_pauses_and_goes_to_a_time(show, browser, finger):
         "const slider = document.getElementById('time'); slider.value = 2; slider.dispatchEvent(new Event('input'));"
     )
     assert bar(browser) == [1.0, 2.0, False]
-    assert shapes_stand(browser, finger, [0.5, 0.5, 0.5])
+    assert shapes_stand(browser, FINGER, [0.5, 0.5, 0.5])
     browser.find_element(By.TAG_NAME, "body").send_keys(Keys.ARROW_RIGHT)
     assert bar(browser)[0] == pytest.approx(1.02)
     browser.find_element(By.TAG_NAME, "body").send_keys(Keys.SPACE)
@@ -162,29 +159,29 @@ def test_the_bar_plays_pauses_and_goes_to_a_time(show, browser, finger):
     assert moved == pytest.approx(2.0 * elapsed, abs=0.2)
 
 
-def test_the_key_names_what_has_a_colour_of_its_own(finger, tmp_path):
+def test_the_key_names_what_has_a_colour_of_its_own(tmp_path):
     q = np.linspace([0.1, 0.2, 0.3], [0.9, 0.8, 0.7], 5)
-    page = replay(finger, q[:1], dt=0.1, html=tmp_path / "plain.html")
+    page = replay(FINGER, q[:1], dt=0.1, html=tmp_path / "plain.html")
     plain = page.read_text()
     # A pose has no bar and does not move.
     assert 'id="bar"' not in plain
     assert all(command["type"] != "set_animation" for command in commands(page))
     assert re.findall("<li>.*</li>", plain) == []
     marked = replay(
-        finger, q, dt=0.1, html=tmp_path / "key.html",
+        FINGER, q, dt=0.1, html=tmp_path / "key.html",
         marks=vp.Marks(trace=True, ghost=q[::-1], torques=np.zeros((4, 3)),
             reference={"way": [[0.0, 0.0, 0.1], [0.1, 0.0, 0.1]]}, targets={"cup <1>": [0.1, 0.0, 0.0]}),
     ).read_text()  # fmt: skip
     words = [re.sub("<.*?>", "", line) for line in re.findall("<li>.*</li>", marked)]
-    frame = finger.end_effector
+    frame = FINGER.end_effector
     paths = [f"path of {frame}", f"path of {frame}, ghost"]
     assert words == ["torque: none, half, all of the limit", "ghost", *paths, "reference: way", "target: cup &lt;1&gt;"]
 
 
-def test_size_stays_sane_for_a_long_motion(finger, tmp_path):
+def test_size_stays_sane_for_a_long_motion(tmp_path):
     t = np.arange(1_000_001) * 1e-3
     q = np.column_stack([np.sin(t), 1.0 + np.cos(0.7 * t), 0.5 + 0.5 * np.sin(1.3 * t)])
-    path = replay(finger, q, dt=1e-3, html=tmp_path / "long.html")
+    path = replay(FINGER, q, dt=1e-3, html=tmp_path / "long.html")
     assert path.stat().st_size < 2_000_000
     assert "<li>drawn every 0.1 s, straight in between</li>" in path.read_text(encoding="utf-8")
     tracks, _ = animation(path)
@@ -194,10 +191,10 @@ def test_size_stays_sane_for_a_long_motion(finger, tmp_path):
         np.testing.assert_allclose(np.interp(t, times, values), column, atol=3e-3)
 
 
-def test_ghost_keeps_its_corners_between_sparse_nodes_of_the_motion(finger, tmp_path):
+def test_ghost_keeps_its_corners_between_sparse_nodes_of_the_motion(tmp_path):
     ghost = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     path = replay(
-        finger, np.zeros((3, 3)), dt=1.0, marks=vp.Marks(ghost=ghost), speed=0.5, html=tmp_path / "ghost.html"
+        FINGER, np.zeros((3, 3)), dt=1.0, marks=vp.Marks(ghost=ghost), speed=0.5, html=tmp_path / "ghost.html"
     )
     tracks, _ = animation(path)
     for (node, _), (times, values) in tracks.items():
@@ -251,10 +248,10 @@ def end(viewer):
     viewer.window.server_proc.wait()
 
 
-def test_live_window(browser, finger, motion, monkeypatch, capfd):
+def test_live_window(browser, motion, monkeypatch, capfd):
     opened = []
     monkeypatch.setattr(page_module.webbrowser, "open", lambda url, new=0: opened.append(url) or True)
-    viewer = replay(finger, motion, marks=vp.Marks(ghost=motion.q[::-1]), open=True)
+    viewer = replay(FINGER, motion, marks=vp.Marks(ghost=motion.q[::-1]), open=True)
     try:
         assert opened == [viewer.url()]
         assert capfd.readouterr().out == ""
@@ -262,14 +259,14 @@ def test_live_window(browser, finger, motion, monkeypatch, capfd):
         browser.get(viewer.url())
         wait_until(lambda: browser.execute_script("return viewer.animator.duration") == 0.5)
         seek(browser, 0.5)
-        assert shapes_stand(browser, finger, motion.q[0], "ghost")
+        assert shapes_stand(browser, FINGER, motion.q[0], "ghost")
     finally:
         browser.get("about:blank")
         end(viewer)
 
 
-def test_a_notebook_shows_the_page_in_a_frame(browser, finger, motion, tmp_path):
-    shown = replay(finger, motion, size=(600, 400))
+def test_a_notebook_shows_the_page_in_a_frame(browser, motion, tmp_path):
+    shown = replay(FINGER, motion, size=(600, 400))
     assert repr(shown) == f"Inline(replay of finger, {len(shown.html) / 1e6:.1f} MB)"
     page = tmp_path / "notebook.html"
     page.write_text(f"<!DOCTYPE html><title>notebook</title><p>above</p>{shown._repr_html_()}<p>below</p>")
@@ -284,23 +281,23 @@ def test_a_notebook_shows_the_page_in_a_frame(browser, finger, motion, tmp_path)
     assert [text.text for text in browser.find_elements("tag name", "p")] == ["above", "below"]
 
 
-def test_says_where_to_look_when_no_browser_opens(finger, motion, monkeypatch, caplog):
+def test_says_where_to_look_when_no_browser_opens(motion, monkeypatch, caplog):
     monkeypatch.setattr(page_module.webbrowser, "open", lambda url, new=0: False)
-    viewer = replay(finger, motion, open=True)
+    viewer = replay(FINGER, motion, open=True)
     end(viewer)
     assert naming(caplog.messages, "browser", viewer.url())
 
 
-def test_refuses_what_it_cannot_show(finger, motion, tmp_path):
+def test_refuses_what_it_cannot_show(motion, tmp_path):
     page = tmp_path / "page.html"
 
-    def no(*facts, robot=finger, motion=motion, html=page, **options):
+    def no(*facts, robot=FINGER, motion=motion, html=page, **options):
         with refused(vp.InputError, *facts):
             replay(robot, motion, html=html, **options)
 
     q = np.zeros((3, 3))
     no("html=path", "open=True", open=True)
-    no("robot", "load_robot", robot=finger.model)
+    no("robot", "load_robot", robot=FINGER.model)
     no("dt", motion=q)
     no("0.001 s", dt=0.1)
     no("dt", "0.0", motion=q, dt=0.0)
@@ -324,7 +321,7 @@ def test_refuses_what_it_cannot_show(finger, motion, tmp_path):
     assert not page.exists()
 
 
-def test_refuses_an_unwritable_path_before_the_work(finger, motion, tmp_path, monkeypatch):
+def test_refuses_an_unwritable_path_before_the_work(motion, tmp_path, monkeypatch):
     def work(robot):
         raise AssertionError("worked first")
 
@@ -332,7 +329,7 @@ def test_refuses_an_unwritable_path_before_the_work(finger, motion, tmp_path, mo
     nowhere = tmp_path / "missing" / "page.html"
     for path, folder in ((nowhere, nowhere.parent), (tmp_path, tmp_path)):
         with refused(vp.FileError, "folder", str(folder)):
-            replay(finger, motion, html=path)
+            replay(FINGER, motion, html=path)
 
 
 @pytest.mark.parametrize("size", [(800, 640), (400, 700)])
@@ -499,12 +496,8 @@ def test_a_follower_is_where_its_leader_puts_it(tmp_path):
 # --- films -----------------------------------------------------------------------------------------------------------
 
 
-Q = np.linspace([0.0, 0.0], [1.2, -0.8], 11)
-
-
-@pytest.fixture(scope="module")
-def chain():
-    return vp.planar_chain(2)
+CHAIN, Q = vp.planar_chain(2), np.linspace([0.0, 0.0], [1.2, -0.8], 11)
+SCENE = vp.Scene(CHAIN)
 
 
 def frames(path):
@@ -513,10 +506,10 @@ def frames(path):
     )
 
 
-def test_frames_are_at_exact_times(browser, chain, tmp_path):
+def test_frames_are_at_exact_times(browser, tmp_path):
     q = np.repeat([[0.0, 0.0], [1.0, 0.5]], [6, 5], axis=0)  # moves between 0.5 s and 0.6 s alone
     path = tmp_path / "jump.gif"
-    assert replay(chain, q, dt=0.1, video=path, fps=10.0, size=(320, 240)) == path
+    assert replay(CHAIN, q, dt=0.1, video=path, fps=10.0, size=(320, 240)) == path
     film = frames(path)
     assert film.shape == (11, 240, 320, 3)
     assert Image.open(path).info["duration"] == 100  # [ms]
@@ -525,9 +518,9 @@ def test_frames_are_at_exact_times(browser, chain, tmp_path):
     assert (np.abs(film[6] - film[5]).max(axis=-1) > 40.0).mean() > 1e-3
 
 
-def test_an_mp4_and_its_page(browser, chain, tmp_path):
+def test_an_mp4_and_its_page(browser, tmp_path):
     path, page = tmp_path / "chain.mp4", tmp_path / "chain.html"
-    assert replay(chain, Q, dt=0.1, html=page, video=path, fps=5.0, size=(320, 240), speed=2.0) == path
+    assert replay(CHAIN, Q, dt=0.1, html=page, video=path, fps=5.0, size=(320, 240), speed=2.0) == path
     film = imageio.imread(path, plugin="FFMPEG").astype(float)
     assert film.shape == (3, 240, 320, 3)
     assert (np.abs(film[2] - film[0]).max(axis=-1) > 40.0).mean() > 1e-3
@@ -542,14 +535,14 @@ def test_frame_times():
     np.testing.assert_array_equal(video.frame_times(".gif", 30.0, 0.0, 99), [0.0])
 
 
-def test_says_what_is_missing_and_how_to_get_it(chain, tmp_path, monkeypatch):
+def test_says_what_is_missing_and_how_to_get_it(tmp_path, monkeypatch):
     found, which = importlib.util.find_spec, shutil.which
 
     def without(*gone):
         monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in gone else found(name))
         monkeypatch.setattr(shutil, "which", lambda name: None if name in gone else (which(name) or f"/usr/bin/{name}"))
         with pytest.raises(vp.MissingDependency) as caught:
-            replay(chain, Q, dt=0.1, video=tmp_path / "chain.gif")
+            replay(CHAIN, Q, dt=0.1, video=tmp_path / "chain.gif")
         return caught.value
 
     error = without("imageio", "imageio_ffmpeg")
@@ -561,7 +554,7 @@ def test_says_what_is_missing_and_how_to_get_it(chain, tmp_path, monkeypatch):
     assert not (tmp_path / "chain.gif").exists()
 
 
-def test_refuses_other_formats_and_sizes(chain, tmp_path):
+def test_refuses_other_formats_and_sizes(tmp_path):
     for name, size, facts in [
         ("chain.avi", (320, 240), ("video", ".gif", ".mp4", "'chain.avi'")),
         ("chain.mp4", (321, 240), ("size", "even", "321 x 240")),
@@ -569,7 +562,7 @@ def test_refuses_other_formats_and_sizes(chain, tmp_path):
         ("chain.mp4", (320, 2), ("size", "16", "2")),
     ]:
         with refused(vp.InputError, facts):
-            replay(chain, Q, dt=0.1, video=tmp_path / name, size=size)
+            replay(CHAIN, Q, dt=0.1, video=tmp_path / name, size=size)
 
 
 @pytest.mark.slow
@@ -585,11 +578,6 @@ def test_the_command_line_films_with_traces(browser, tmp_path, capsys):
 
 
 # --- motions and plans while they are computed -----------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def scene():
-    return vp.Scene(vp.planar_chain(2))
 
 
 @pytest.fixture
@@ -631,27 +619,27 @@ def test_the_robot_is_where_the_motion_is_while_it_is_computed(seen, browser):
     assert severe(browser) == []
 
 
-def test_a_motion_takes_the_time_that_it_would_take(opened, scene, monkeypatch):
-    view = opened(scene, speed=2.0, fps=20.0)
+def test_a_motion_takes_the_time_that_it_would_take(opened, monkeypatch):
+    view = opened(SCENE, speed=2.0, fps=20.0)
     motion = {"dt": 1e-3, "steps": 1000, "progress": view.progress, "check": False}
     begin = time.monotonic()
-    vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], **motion)
+    vp.simulate(SCENE, [0.3, 0.0], [0.0, 0.0], **motion)
     # Nobody looks, so nobody waits.
     assert time.monotonic() - begin < 0.45
     monkeypatch.setattr(live._Window, "watched", property(lambda window: True))
     shown, move = [], view._move
     monkeypatch.setattr(view, "_move", lambda t, q, now, *rest, **last: shown.append(now) or move(t, q, now, *rest))
     begin = time.monotonic()
-    end = vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], **motion).t[-1]
+    end = vp.simulate(SCENE, [0.3, 0.0], [0.0, 0.0], **motion).t[-1]
     assert time.monotonic() - begin > 0.45
     assert shown == sorted(shown)
     assert len(shown) <= 13
     assert shown[-1] == end
 
 
-def test_a_controllers_run_is_shown(opened, scene):
+def test_a_controllers_run_is_shown(opened):
     cost = vp.TrackingCost([0.5, -1.0], 10.0) + vp.VelocityCost(0.1) + vp.ControlCost(1e-4)
-    problem = vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], dt=2e-2, steps=20)
+    problem = vp.OptimalControlProblem(SCENE, cost, [0.0, 0.0], [0.0, 0.0], dt=2e-2, steps=20)
     view = opened(problem, speed=None)
     parts = []
 
@@ -665,8 +653,8 @@ def test_a_controllers_run_is_shown(opened, scene):
     np.testing.assert_array_equal(view._q, run.motion.q[-1])
 
 
-def test_the_camera_moves_back_from_what_leaves_the_view(opened, scene):
-    view = opened(scene.robot)
+def test_the_camera_moves_back_from_what_leaves_the_view(opened):
+    view = opened(SCENE.robot)
     before = view._in_view
     view._keep_in_view(np.array([[9.0, 0.0, 0.0]]))
     assert view._in_view.max() > 10.0
@@ -675,8 +663,8 @@ def test_the_camera_moves_back_from_what_leaves_the_view(opened, scene):
     assert view._in_view is after is not before
 
 
-def test_ctrl_c_ends_the_motion_and_not_the_view(opened, scene):
-    view = opened(scene, speed=None)
+def test_ctrl_c_ends_the_motion_and_not_the_view(opened):
+    view = opened(SCENE, speed=None)
 
     def progress(done, steps, nodes):
         view.progress(done, steps, nodes)
@@ -686,48 +674,48 @@ def test_ctrl_c_ends_the_motion_and_not_the_view(opened, scene):
             raise KeyboardInterrupt
 
     with pytest.raises(vp.Interrupted) as caught:
-        vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-4, steps=100_000, progress=progress)
+        vp.simulate(SCENE, [0.3, 0.0], [0.0, 0.0], dt=1e-4, steps=100_000, progress=progress)
     assert 0 < caught.value.trajectory.steps < 100_000
-    motion = vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=10, progress=view.progress)
+    motion = vp.simulate(SCENE, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=10, progress=view.progress)
     np.testing.assert_array_equal(view._q, motion.q[-1])
 
 
-def test_a_server_that_dies_costs_the_picture_alone(opened, scene, caplog, monkeypatch):
+def test_a_server_that_dies_costs_the_picture_alone(opened, caplog, monkeypatch):
     monkeypatch.setattr(live, "_ANSWER_LIMIT", 0.2)
-    view = opened(scene, speed=None)
+    view = opened(SCENE, speed=None)
     view._window.server_proc.kill()
     with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
-        motion = vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=10, progress=view.progress)
+        motion = vp.simulate(SCENE, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=10, progress=view.progress)
     assert motion.steps == 10
     assert caplog.text.count("the computation continues without it") == 1
 
 
-def test_a_browser_is_started_and_waited_for(scene, monkeypatch, caplog, capfd):
+def test_a_browser_is_started_and_waited_for(monkeypatch, caplog, capfd):
     asked = []
     monkeypatch.setattr(page.webbrowser, "open", lambda url, new=0: asked.append(url) or True)
     monkeypatch.setattr(live.LiveView.wait, "__defaults__", (0.1,))
-    with vp.LiveView(scene) as view:
+    with vp.LiveView(SCENE) as view:
         assert asked == [view.url]
         assert f'<iframe src="{view.url}"' in view._repr_html_()
     assert "no browser shows" in caplog.text
     assert capfd.readouterr().out == ""
     assert "closed" in repr(view)
     # What is told a closed view is lost, and nothing else.
-    vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=10, progress=view.progress)
+    vp.simulate(SCENE, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=10, progress=view.progress)
 
 
-def test_says_what_does_not_fit(opened, scene):
-    problem = vp.OptimalControlProblem(scene, vp.ControlCost(1.0), [0.0, 0.0], [0.0, 0.0], dt=1e-2, steps=5)
-    other, tell = vp.Scene(vp.planar_chain(3)), opened(scene).progress
+def test_says_what_does_not_fit(opened):
+    problem = vp.OptimalControlProblem(SCENE, vp.ControlCost(1.0), [0.0, 0.0], [0.0, 0.0], dt=1e-2, steps=5)
+    other, tell = vp.Scene(vp.planar_chain(3)), opened(SCENE).progress
     with refused(vp.InputError, "progress"):
         vp.solve(problem, progress=tell)
     with refused(vp.InputError, "'chain2'", "2", "3"):
         vp.simulate(other, np.zeros(3), np.zeros(3), dt=1e-3, steps=10, progress=tell)
     for given, options, kind, facts in (
-        (scene, {"marks": vp.Marks(ghost=[[0.0, 0.0]])}, vp.InputError, "ghost"),
-        (scene, {"marks": vp.Marks(trace="hand")}, vp.UnknownFrame, ("trace", "'chain2'", "'hand'")),
-        (scene, {"speed": 0.0}, vp.InputError, ("speed", "0.0")),
-        (scene.robot.model, {}, vp.InputError, ("LiveView", "Robot", "Scene", "OptimalControlProblem")),
+        (SCENE, {"marks": vp.Marks(ghost=[[0.0, 0.0]])}, vp.InputError, "ghost"),
+        (SCENE, {"marks": vp.Marks(trace="hand")}, vp.UnknownFrame, ("trace", "'chain2'", "'hand'")),
+        (SCENE, {"speed": 0.0}, vp.InputError, ("speed", "0.0")),
+        (SCENE.robot.model, {}, vp.InputError, ("LiveView", "Robot", "Scene", "OptimalControlProblem")),
     ):
         with refused(kind, facts):
             vp.LiveView(given, **options)
@@ -746,7 +734,7 @@ CONTROLS = [
 
 
 @pytest.mark.parametrize("controls", CONTROLS)
-def test_who_asks_for_nodes_gets_all_of_them_once(scene, controls, monkeypatch):
+def test_who_asks_for_nodes_gets_all_of_them_once(controls, monkeypatch):
     monkeypatch.setattr("varpin.simulation.simulate._CHUNK", 50)
     parts = []
 
@@ -757,7 +745,7 @@ def test_who_asks_for_nodes_gets_all_of_them_once(scene, controls, monkeypatch):
 
     given = {"q0": [0.3, 0.0], "v0": [0.0, 0.0], "dt": 1e-3, "steps": 400, "controls": controls}
     given |= {"period": 3} if controls is law else {}
-    told, plain = vp.simulate(scene, **given, progress=progress), vp.simulate(scene, **given)
+    told, plain = vp.simulate(SCENE, **given, progress=progress), vp.simulate(SCENE, **given)
     assert len(parts) > 10
     for name in ("t", "q", "v"):
         rows = np.concatenate([getattr(parts[0], name)[:1], *(getattr(part, name)[1:] for part in parts)])
@@ -768,16 +756,16 @@ def test_who_asks_for_nodes_gets_all_of_them_once(scene, controls, monkeypatch):
         np.testing.assert_array_equal(before.q[-1], after.q[0])
 
 
-def test_functions_of_two_arguments_are_told_as_before(scene, capsys):
+def test_functions_of_two_arguments_are_told_as_before(capsys):
     start = {"q0": [0.3, 0.0], "v0": [0.0, 0.0], "dt": 1e-3, "steps": 10}
     told = []
-    vp.simulate(scene, **start, progress=lambda done, steps: told.append((done, steps)))
-    vp.simulate(scene, **start, progress=lambda *given: told.append(given))
+    vp.simulate(SCENE, **start, progress=lambda done, steps: told.append((done, steps)))
+    vp.simulate(SCENE, **start, progress=lambda *given: told.append(given))
     assert told == [(10, 10), (10, 10)]
-    vp.simulate(scene, **start, progress=print)
+    vp.simulate(SCENE, **start, progress=print)
     assert capsys.readouterr().out == "10 10\n"
     for wrong in (lambda done: None, 3):
         with refused(vp.InputError, "progress"):
-            vp.simulate(scene, **start, progress=wrong)
-    vp.simulate(scene, **(start | {"steps": 0}), progress=lambda done, steps, nodes: told.append(nodes.q))
+            vp.simulate(SCENE, **start, progress=wrong)
+    vp.simulate(SCENE, **(start | {"steps": 0}), progress=lambda done, steps, nodes: told.append(nodes.q))
     np.testing.assert_array_equal(told[-1], [[0.3, 0.0]])

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pinocchio as pin
 import pytest
+import zoo
 from chromium import animation, commands, names, picture, pose, poses, seek, shape_poses, shapes_stand
 from oracles import placements
 from plan_problems import CAPSULES
@@ -15,24 +16,14 @@ from scipy.spatial.transform import Rotation
 import varpin as vp
 from varpin import replay
 
-TIP = "tool0"
+TIP, UR5 = "tool0", zoo.robot("ur5")
+SWEEP = 0.8 * np.sin(np.linspace(0.0, 1.0, 21)[:, None] * [1.0, 2.0, 1.5, 3.0, 2.5, 0.7] + np.arange(6))
 
 
 @pytest.fixture(scope="module")
-def ur5():
-    return vp.load_robot("ur5")
-
-
-@pytest.fixture(scope="module")
-def arm(ur5):
+def arm():
     """A UR5 without meshes, a skeleton, which software draws in a tenth of the time."""
-    return vp.load_robot(ur5.model)
-
-
-@pytest.fixture(scope="module")
-def sweep():
-    t = np.linspace(0.0, 1.0, 21)[:, None]
-    return 0.8 * np.sin(np.array([1.0, 2.0, 1.5, 3.0, 2.5, 0.7]) * t + np.arange(6))
+    return vp.load_robot(UR5.model)
 
 
 def places(robot, q, frame):
@@ -58,15 +49,15 @@ def farthest(points, path):
     return max(np.linalg.norm(path - point, axis=1).min() for point in points)
 
 
-def test_traces_are_where_pinocchio_puts_the_frame(show, browser, arm, sweep):
+def test_traces_are_where_pinocchio_puts_the_frame(show, browser, arm):
     reference = np.array([[0.5, 0.0, 0.1], [0.5, 0.4, 0.1], [0.5, 0.4, 0.1], [0.5, 0.4, 0.6]])
-    ghost = sweep[::-1] + 0.2
+    ghost = SWEEP[::-1] + 0.2
     # A frame that stays leaves no trace.
     marks = vp.Marks(trace=[TIP, "wrist_1_link", "base_link"], reference={"corner": reference}, ghost=ghost)
-    show(arm, sweep, dt=0.05, marks=marks)
+    show(arm, SWEEP, dt=0.05, marks=marks)
     assert len(names(browser, ["notes"])) == 5
     fine, rows = np.arange(0.0, 20.0 + 1e-9, 0.01), np.arange(21)
-    for name, q in (("1 motion tool0", sweep), ("2 motion wrist_1_link", sweep), ("3 ghost tool0", ghost)):
+    for name, q in (("1 motion tool0", SWEEP), ("2 motion wrist_1_link", SWEEP), ("3 ghost tool0", ghost)):
         frame = name.split()[-1]
         expected = places(arm, np.column_stack([np.interp(fine, rows, column) for column in q.T]), frame)
         points = tube(browser, ["notes", name])
@@ -88,9 +79,9 @@ def test_a_trace_of_a_long_motion_stays_small_and_true(show, browser, arm):
     assert farthest(points, places(arm, q, arm.end_effector)) < 1e-5
 
 
-def test_a_growing_trace_is_drawn_as_far_as_the_motion_has_come(show, browser, arm, sweep):
+def test_a_growing_trace_is_drawn_as_far_as_the_motion_has_come(show, browser, arm):
     # It rests from 0.5 s to 0.75 s, and its ghost goes the other way.
-    q = np.vstack([sweep[:11], np.repeat(sweep[10:11], 5, axis=0), sweep[11:]])
+    q = np.vstack([SWEEP[:11], np.repeat(SWEEP[10:11], 5, axis=0), SWEEP[11:]])
     ghost = q[::-1]
     show(arm, q, dt=0.05, marks=vp.Marks(ghost=ghost, trace=TIP, growing=True), fps=100.0)
     for name, rows in (("0 motion tool0", q), ("1 ghost tool0", ghost)):
@@ -145,17 +136,17 @@ def test_a_controllers_run_shows_its_plans(show, browser, run):
             np.testing.assert_allclose(figure[max(figure)][:3, 3], center, atol=1e-5)
 
 
-def test_frames_move_with_the_robot(show, browser, arm, sweep):
-    show(arm, sweep, dt=0.05, marks=vp.Marks(frames=[TIP, "base_link"]))
+def test_frames_move_with_the_robot(show, browser, arm):
+    show(arm, SWEEP, dt=0.05, marks=vp.Marks(frames=[TIP, "base_link"]))
     seek(browser, 0.725)
     found = poses(browser, [], "node.name.includes(' frame ')")
     assert sorted(name.split()[2] for name in found) == ["base_link", TIP]
     for name, now in found.items():
-        (place,) = placements(arm, 0.5 * (sweep[14:15] + sweep[15:16]), name.split()[2])
+        (place,) = placements(arm, 0.5 * (SWEEP[14:15] + SWEEP[15:16]), name.split()[2])
         np.testing.assert_allclose(now, place.homogeneous, atol=2e-5)
 
 
-def test_targets_stand_or_move(show, browser, arm, sweep):
+def test_targets_stand_or_move(show, browser, arm):
     turn = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
     half = Rotation.from_euler("z", 45.0, degrees=True).as_matrix()
     first, last = pin.SE3(np.eye(3), np.array([0.1, 0.2, 0.3])), pin.SE3(turn, np.array([0.5, 0.2, 0.3]))
@@ -165,7 +156,7 @@ def test_targets_stand_or_move(show, browser, arm, sweep):
         "pose": last,
         "turns": [first, last],
     }
-    show(arm, sweep, dt=0.05, speed=0.5, marks=vp.Marks(targets=targets))
+    show(arm, SWEEP, dt=0.05, speed=0.5, marks=vp.Marks(targets=targets))
     nodes = {name: ["notes", f"{k} target {name}"] for k, name in enumerate(targets)}
     assert names(browser, ["notes"]) == [path[-1] for path in nodes.values()]
     for seconds, moving, turning in [
@@ -255,15 +246,15 @@ def test_robots_side_by_side_keep_their_own_motions(show, browser):
     assert all(before.max() < after.min() for before, after in itertools.pairwise(spans))
 
 
-def test_refuses_marks_it_cannot_show(ur5, sweep, run, crank, tmp_path):
+def test_refuses_marks_it_cannot_show(run, crank, tmp_path):
     page = tmp_path / "page.html"
 
-    def no(*facts, robot=ur5, motion=sweep, dt=0.05, **marks):
+    def no(*facts, robot=UR5, motion=SWEEP, dt=0.05, **marks):
         with refused(vp.InputError, *facts):
             replay(robot, motion, dt=dt, html=page, marks=vp.Marks(**marks))
 
     with refused(vp.UnknownFrame, "trace", "'ur5'", "'fore_link'", "'forearm_link'"):
-        replay(ur5, sweep, dt=0.05, html=page, marks=vp.Marks(trace="fore_link"))
+        replay(UR5, SWEEP, dt=0.05, html=page, marks=vp.Marks(trace="fore_link"))
     no("frames", "3", frames=[3])
     no("trace", "None", trace=None)
     no("reference", "(K, 3)", "(3,)", reference=[0.0, 0.0, 1.0])
@@ -274,16 +265,16 @@ def test_refuses_marks_it_cannot_show(ur5, sweep, run, crank, tmp_path):
     no("targets['a']", "(3,)", "shape ()", targets={"a": 3.0})
     no("targets['a'][2]", "inf", targets={"a": [0.0, 0.0, np.inf]})
     no("targets['a']", "pose", targets={"a": np.diag([1.0, 1.0, -1.0, 1.0])})
-    no("targets['a']", "2", motion=sweep[:1], targets={"a": np.zeros((2, 3))})
+    no("targets['a']", "2", motion=SWEEP[:1], targets={"a": np.zeros((2, 3))})
     no("torques=True", torques=True)
     no("torques", "(N, 6)", "(20, 5)", torques=np.zeros((20, 5)))
-    no("robots", "pairs", robot=[(ur5, sweep)])
-    no("robots", "pairs", robot=[ur5, ur5], motion=None)
+    no("robots", "pairs", robot=[(UR5, SWEEP)])
+    no("robots", "pairs", robot=[UR5, UR5], motion=None)
     with refused(vp.InputError, "marks", "Marks(trace=True)", "{'trace': True}"):
-        replay(ur5, sweep, dt=0.05, html=page, marks={"trace": True})
+        replay(UR5, SWEEP, dt=0.05, html=page, marks={"trace": True})
     no("ahead", "Mpc", ahead=0.1)
     no("ahead", "-0.1", robot=run.plans[0].problem.scene.robot, motion=run, dt=None, ahead=-0.1)
-    no("motion 2", "(N + 1, 6)", robot=[(ur5, sweep), (ur5, sweep[:, :3])], motion=None)
+    no("motion 2", "(N + 1, 6)", robot=[(UR5, SWEEP), (UR5, SWEEP[:, :3])], motion=None)
     no("motion", motion=None)
     no("'chain2'", robot=vp.planar_chain(2), motion=crank[1].q, constraints=crank[0])
     no("constraints", "'all'", constraints="all")

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from findings import about
-from oracles import Mechanism, exact, slope
+from oracles import Mechanism, exact, jacobian
 from plan_problems import SMALL, UR5, arm, linear, reach
 from refusals import naming, refused, unnamed
 
@@ -107,8 +107,8 @@ def test_policy_on_velocities_and_back():
     for r in (0, 2, 5):
         q, v = plan.trajectory.q[5 * r], plan.trajectory.v[5 * r]
         np.testing.assert_array_equal(policy.reference[r], np.concatenate([q, v]))
-        columns = np.array([slope(lambda x, v=v: own.mass_matrix(x) @ v, q, e, 0.02) for e in np.eye(n)])
-        turned = plan.gains[r] @ np.block([[np.eye(n), np.zeros((n, n))], [columns.T, own.mass_matrix(q)]])
+        columns = jacobian(lambda x, v=v: own.mass_matrix(x) @ v, q, 0.02)
+        turned = plan.gains[r] @ np.block([[np.eye(n), np.zeros((n, n))], [columns, own.mass_matrix(q)]])
         np.testing.assert_allclose(policy.gains[r], turned, rtol=0, atol=1e-8 * np.abs(turned).max())
     other = plan.problem.at(integrator=vp.RungeKutta4())
     turned = dataclasses.replace(plan, problem=other, gains=plan.policy_on("velocity").gains.copy())

@@ -212,10 +212,14 @@ def test_a_force_that_is_met_within_a_step_is_in_the_motion():
     high, width, begin = 10.0, 0.06, 0.4
 
     def ridge(q, v):
-        y = (q - begin) / width
-        return np.where((y > 0.0) & (y < 1.0), -high * 30.0 * y**2 * (1.0 - y) ** 2, 0.0)
+        y = np.clip((q - begin) / width, 0.0, 1.0)
+        return -high * 30.0 * y**2 * (1.0 - y) ** 2
 
-    scene = vp.Scene(vp.planar_chain(1), gravity=False, forces=vp.CustomForce(ridge))
+    def slopes(q, v):
+        y = np.clip((q - begin) / width, 0.0, 1.0)
+        return np.diag(-high * 60.0 * y * (1.0 - y) * (1.0 - 2.0 * y) / width), np.zeros((1, 1))
+
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, forces=vp.CustomForce(ridge, slopes))
     M = vp.lagrangian_jet(scene, [0.0], [0.0]).Lvv[0, 0]
     motion = vp.simulate(scene, [0.0], [3.0], duration=0.4, tolerance=1e-4)
     assert motion.accuracy.met

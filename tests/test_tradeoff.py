@@ -16,6 +16,8 @@ from varpin.study import advice as advising
 from varpin.study.record import pareto_front
 
 OMEGA = 3.0
+COST, LINK = vp.TrackingCost([1.0]) + vp.ControlCost(1e-2), vp.Scene(vp.planar_chain(1))
+PROBLEM = vp.OptimalControlProblem(LINK, COST, [0.0], [0.0], dt=0.05, steps=20)
 
 
 def spring():
@@ -110,7 +112,7 @@ def test_members_that_fail_do_not_stop_the_others():
     assert record.failures[0].startswith("ExplicitEuler, dt = 0.001 s: step ")
 
 
-def test_interrupted_studies_hold_the_runs_that_are_done(problem):
+def test_interrupted_studies_hold_the_runs_that_are_done():
     def interrupt(done, runs):
         assert runs == 4
         if done == 3:
@@ -120,7 +122,7 @@ def test_interrupted_studies_hold_the_runs_that_are_done(problem):
     with pytest.raises(vp.StudyInterrupted) as motions:
         vp.work_precision(spring(), [0.7], [0.3], duration=1.0, **options)
     with pytest.raises(vp.StudyInterrupted) as plans:
-        vp.optimal_control_tradeoff(problem, max_iterations=1, **options)
+        vp.optimal_control_tradeoff(PROBLEM, max_iterations=1, **options)
     for stop in (motions.value, plans.value):
         assert isinstance(stop, KeyboardInterrupt)
         assert stop.record.missing == 1
@@ -175,15 +177,9 @@ def test_figure_and_table(oscillator, tmp_path):
     assert page.count("<tr") == 1 + len(oscillator.runs) + len(oscillator.notes)
 
 
-@pytest.fixture(scope="module")
-def problem():
-    cost = vp.TrackingCost([1.0]) + vp.ControlCost(1e-2)
-    return vp.OptimalControlProblem(vp.Scene(vp.planar_chain(1)), cost, [0.0], [0.0], dt=0.05, steps=20)
-
-
-def test_true_costs_of_plans(problem, tmp_path):
+def test_true_costs_of_plans(tmp_path):
     members, dts = [vp.ExplicitEuler(), vp.Midpoint()], [0.1, 0.05, 0.025]
-    record = vp.optimal_control_tradeoff(problem, members, dts, period=0.1)
+    record = vp.optimal_control_tradeoff(PROBLEM, members, dts, period=0.1)
     assert [run.hold for run in record.runs] == [1, 2, 4] * 2
     assert all(not run.failure and run.status == "converged" and run.accuracy < 1e-8 for run in record.runs)
     gaps = np.array([abs(run.planned_cost - run.open_loop_cost) for run in record.runs]).reshape(2, 3)
@@ -194,12 +190,12 @@ def test_true_costs_of_plans(problem, tmp_path):
     assert len(list(csv.reader(record.to_csv(tmp_path / "plans.csv").open()))) == 7
 
 
-def test_plans_that_fail_do_not_stop_the_others(problem):
-    record = vp.optimal_control_tradeoff(problem, [Broken(), vp.Midpoint()], [0.05])
+def test_plans_that_fail_do_not_stop_the_others():
+    record = vp.optimal_control_tradeoff(PROBLEM, [Broken(), vp.Midpoint()], [0.05])
     assert record.runs[0].failure == "ZeroDivisionError: on purpose"
     assert not record.runs[1].failure
     with refused(vp.InputError, "dt"):
-        vp.optimal_control_tradeoff(problem, [vp.Midpoint()], [0.05], period=0.07)
+        vp.optimal_control_tradeoff(PROBLEM, [vp.Midpoint()], [0.05], period=0.07)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,8 @@ from varpin.control.checks import foreseen
 HOME = np.array([0.0, -90.0, 90.0, 0.0, 45.0, 0.0])
 FACTS = ("'shoulder_lift_joint'", "-90 rad", "14 turns", "looks like degrees", "np.deg2rad")
 REST = np.zeros(6)
+UR5 = vp.load_robot("ur5")
+FLOATING = vp.Scene(UR5, gravity=False)
 SHORT = {"dt": 1e-3, "steps": 2}
 SLIDE, TURN, WHEEL = pin.JointModelPX(), pin.JointModelRY(), pin.JointModelRUBY()
 
@@ -27,11 +29,6 @@ def arm(*joints, lower=-9.0, upper=9.0):
         rod = pin.Inertia(1.0, np.array([0.5, 0.0, 0.0]), np.diag([0.001, 0.083, 0.083]))
         model.appendBodyToJoint(place, rod, pin.SE3.Identity())
     return vp.load_robot(model)
-
-
-@pytest.fixture(scope="module")
-def scene():
-    return vp.Scene(vp.load_robot("ur5"), gravity=False)
 
 
 def moved(scene, q0=REST, v0=REST, **options):
@@ -127,10 +124,10 @@ def test_plans_ensembles_and_controllers_tell_of_all_limits():
             assert about(told, kind), told
 
 
-def test_a_start_in_degrees(scene, capsys):
-    assert not unnamed(moved(scene, HOME)[0], FACTS)
-    assert not naming(moved(scene, np.deg2rad(HOME)), "degrees")
-    ensemble = vp.simulate_ensemble(scene, HOME, REST, **SHORT, paths=2, rng=0, workers=1)
+def test_a_start_in_degrees(capsys):
+    assert not unnamed(moved(FLOATING, HOME)[0], FACTS)
+    assert not naming(moved(FLOATING, np.deg2rad(HOME)), "degrees")
+    ensemble = vp.simulate_ensemble(FLOATING, HOME, REST, **SHORT, paths=2, rng=0, workers=1)
     assert not unnamed(ensemble.warnings[0], FACTS)
     assert main(["simulate", "ur5", "--steps", "2", "--q0", *map(str, HOME)]) == 0
     assert not unnamed(" ".join(capsys.readouterr().err.split()), FACTS)
@@ -139,20 +136,20 @@ def test_a_start_in_degrees(scene, capsys):
 @pytest.mark.parametrize(
     ("speed", "told"), [(90.0, True), (-22.5, True), (22.51234, False), (3.1, False), (12.5, False)]
 )
-def test_a_speed_beyond_its_limit_in_degrees(scene, speed, told):
+def test_a_speed_beyond_its_limit_in_degrees(speed, told):
     v0 = speed * np.eye(6)[1]
-    found = naming(moved(scene, v0=v0, dt=1e-4), "looks like degrees")
+    found = naming(moved(FLOATING, v0=v0, dt=1e-4), "looks like degrees")
     assert [not unnamed(text, "v0", "'shoulder_lift_joint'", f"{speed:g} rad/s") for text in found] == [True] * told
-    free = scene.robot.model.copy()
+    free = UR5.model.copy()
     free.velocityLimit = np.full(6, np.inf)
     assert not naming(moved(vp.Scene(vp.load_robot(free)), v0=v0, dt=1e-4), "looks like degrees")
 
 
-def test_positions_for_servos_in_degrees(scene):
-    servos = vp.Scene(scene.robot, gravity=False, damping=1.0, forces=[vp.PositionServo(100.0, 10.0)])
+def test_positions_for_servos_in_degrees():
+    servos = vp.Scene(UR5, gravity=False, damping=1.0, forces=[vp.PositionServo(100.0, 10.0)])
     for controls in (HOME, lambda t, q, v: HOME):
         assert not unnamed(moved(servos, controls=controls)[0], ("controls", *FACTS))
-    assert not naming(moved(scene, controls=HOME), "degrees")
+    assert not naming(moved(FLOATING, controls=HOME), "degrees")
     assert not naming(moved(servos, controls=np.deg2rad(HOME)), "degrees")
     assert len(naming(moved(servos, HOME), "degrees")) == 1
 
@@ -165,16 +162,16 @@ def test_joints_without_limits_may_have_turned_many_times(q, told):
     assert not naming(moved(slide, [q], [0.0]), "degrees")
 
 
-def test_other_positions_in_degrees(scene, caplog):
+def test_other_positions_in_degrees(caplog):
     vp.load_robot("ur5", lock={"elbow_joint": 90})
     vp.load_robot(arm(WHEEL, WHEEL).model, lock={"joint1": 57.2957795})
-    vp.Scene(scene.robot, stiffness=1.0, rest=HOME)
+    vp.Scene(UR5, stiffness=1.0, rest=HOME)
     elbow, wheel, rest = caplog.messages
     assert not unnamed(elbow, ("elbow_joint", "90", "looks like degrees"))
     assert not unnamed(wheel, ("57.2958", "looks like degrees"))
     assert not unnamed(rest, ("rest", *FACTS))
     with refused(vp.InputError, "q0", *FACTS):
-        moved(vp.Scene(scene.robot, constraints=[vp.PointOnPoint("tool0", [0.8, 0.1, 0.2])]), HOME)
+        moved(vp.Scene(UR5, constraints=[vp.PointOnPoint("tool0", [0.8, 0.1, 0.2])]), HOME)
 
 
 def test_stops_in_degrees(caplog):
@@ -186,9 +183,9 @@ def test_stops_in_degrees(caplog):
     assert naming(caplog.messages, "looks like degrees") == caplog.messages
 
 
-def test_references_along_a_plan_are_looked_at_too(scene):
+def test_references_along_a_plan_are_looked_at_too():
     goal, cost = np.array([0.0, -90.0, 90.0, 0.0, 45.0, 0.0]), vp.ControlCost(1e-3)
-    problem = vp.OptimalControlProblem(scene, cost, REST, REST, dt=0.05, steps=4)
+    problem = vp.OptimalControlProblem(FLOATING, cost, REST, REST, dt=0.05, steps=4)
     for scale, told in ((1.0, True), (np.pi / 180.0, False)):
         for reference in (scale * goal, [scale * goal] * 5, lambda t, goal=scale * goal: goal):
             found = foreseen(problem.at(cost=cost + vp.TrackingCost(reference)))
@@ -198,7 +195,6 @@ def test_references_along_a_plan_are_looked_at_too(scene):
 # --- joint values by name, holding torques and gravity ---------------------------------------------------------------
 
 
-UR5 = vp.load_robot("ur5")
 NAMES = UR5.joint_names
 SCENE = vp.Scene(UR5, damping=0.1)
 POSE = {"elbow_joint": 1.1, "shoulder_lift_joint": 0.7}
@@ -272,20 +268,6 @@ def test_names_and_numbers_that_are_none_are_named(call):
     for value, facts in ((np.nan, ("'elbow_joint'", "nan")), ("a", "'a'")):
         with refused(vp.InputError, facts):
             call({"elbow_joint": value})
-
-
-@pytest.mark.parametrize("name", ["ur5", "panda", "finger"])
-def test_holding_torque_is_pinocchios_gravity_and_the_springs(name):
-    robot = vp.load_robot(name)
-    rng = np.random.default_rng(3)
-    q, stiffness, rest = rng.uniform(-1, 1, (3, robot.dof))
-    scene = vp.Scene(robot, gravity=(1.0, -2.0, -7.0), stiffness=np.abs(stiffness), rest=rest)
-    model = robot.model.copy()
-    model.gravity = pin.Motion(np.array([1.0, -2.0, -7.0]), np.zeros(3))
-    pull = pin.computeGeneralizedGravity(model, model.createData(), robot.configuration(q))
-    expected = robot.velocity(np.eye(robot.dof)) @ pull + np.abs(stiffness) * (q - rest)
-    np.testing.assert_allclose(scene.holding_torque(q), expected, atol=1e-10)
-    np.testing.assert_allclose(scene.holding_controls(q), expected, atol=1e-10)
 
 
 def test_an_arm_stays_under_its_holding_torque_and_controls():

@@ -259,5 +259,24 @@ FIELD = vp.CustomNoise(
     dq=lambda q, v, u: np.array([[[0.0, 0.1]], [[-0.3 * np.sin(q[0]), 0.0]]]),
     du=lambda q, v, u: np.array([[[0.0, 0.0]], [[0.0, 0.1]]]),
 )  # fmt: skip
+
+
+def rough(n: int, m: int, strength: float) -> vp.CustomNoise:
+    """F = strength (q q' + diag(1 + v^2 / 2 + q v) + u_0) of n joints under m controls, with all its derivatives."""
+    eye, first = np.eye(n), np.eye(m)[0]
+
+    def diagonal(values: np.ndarray) -> np.ndarray:
+        return np.einsum("ik,ic,i->ikc", eye, eye, values)
+
+    return vp.CustomNoise(
+        field=lambda q, v, u: strength * (np.outer(q, q) + np.diag(1.0 + 0.5 * v**2 + q * v) + u[0]),
+        processes=n,
+        dq=lambda q, v, u: strength * (eye[:, None] * q[:, None] + eye * q[:, None, None] + diagonal(v)),
+        dv=lambda q, v, u: strength * diagonal(q + v),
+        du=lambda q, v, u: strength * np.einsum("ik,m->ikm", np.ones((n, n)), first),
+        check=True,
+    )
+
+
 add("custom noise", chain(2, damping=0.2, noise=FIELD), (0.3, -0.5), (1.0, 0.5), 0.01)
 add("trembling loop", chain(3, noise=vp.AdditiveNoise(0.2), constraints=vp.PointOnPoint("tip", TIP, "xz")), **FOUR)
