@@ -293,9 +293,9 @@ class CustomConstraint(Constraint):
 
     def _checked(self, name: str, shape: tuple[int, ...], *arguments: Floats) -> Floats:
         """The result of a function; a CustomConstraintError if it raised, or is not a finite array of this shape."""
-        at = f" at q = {np.array2string(arguments[0], precision=6)}"
-        call = partial(getattr(self, name), *arguments)
-        return returned(f"the {name} of a CustomConstraint", call, shape, at, CustomConstraintError)
+        call, told = partial(getattr(self, name), *arguments), f"the {name} of a CustomConstraint"
+        at = partial(np.array2string, arguments[0], precision=6)
+        return returned(told, call, shape, lambda: f" at q = {at()}", CustomConstraintError)
 
 
 class CustomConstraintError(InputError):

@@ -165,7 +165,8 @@ class CustomForce(Force):
                 )
 
     def _read(self, call: Callable[[], object], what: str, shape: tuple[int, ...], q: Floats, v: Floats) -> Floats:
-        return returned(f"CustomForce {self.name}: {what}", call, shape, f" at {_state_text(q, v)}", CustomForceError)
+        name = f"CustomForce {self.name}: {what}"
+        return returned(name, call, shape, lambda: f" at {_state_text(q, v)}", CustomForceError)
 
 
 def _state_text(q: Floats, v: Floats) -> str:

@@ -163,22 +163,28 @@ def some_limits(
 
 def over_time(name: str, function: Callable[[float], ArrayLike], times: Floats, size: int) -> Floats:
     """Values (N, size) of a function of time at times (N,) [s]."""
-    rows = [returned(name, partial(function, t), (size,), f" at t = {t:.6g} s") for t in times.tolist()]
+    rows = [
+        returned(name, partial(function, t), (size,), partial(" at t = {:.6g} s".format, t)) for t in times.tolist()
+    ]
     return np.array(rows).reshape(len(times), size)
 
 
 def returned(
-    name: str, call: Callable[[], object], shape: tuple[int, ...], at: str = "", error: type[InputError] = InputError
+    name: str,
+    call: Callable[[], object],
+    shape: tuple[int, ...],
+    at: Callable[[], str] = str,
+    error: type[InputError] = InputError,
 ) -> Floats:
-    """What a user's function returns, an array of ``shape``; messages end with ``at``."""
+    """What a user's function returns, an array of ``shape``; messages end with ``at()``, made for them alone."""
     try:
         value = call()
     except Exception as cause:
-        raise error(f"{name} raised {cause!r}{at}") from cause
+        raise error(f"{name} raised {cause!r}{at()}") from cause
     try:
         return finite_array(name, value, shape)  # type: ignore[arg-type]
     except InputError as wrong:
-        raise error(f"{wrong}{at}") from None
+        raise error(f"{wrong}{at()}") from None
 
 
 def as_floats(name: str, value: object) -> Floats:

@@ -385,7 +385,7 @@ def sample(
     """
     if callable(reference):
         try:
-            given = [(partial(reference, t), shape, f" at t = {t:.6g} s") for t in points.t.tolist()]
+            given = [(partial(reference, t), shape, partial(" at t = {:.6g} s".format, t)) for t in points.t.tolist()]
             found = np.array([returned("the reference", *each) for each in given])
             return _rotations(name, found) if len(shape) == 2 else found
         except InputError as error:
