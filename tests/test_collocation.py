@@ -330,4 +330,5 @@ def test_blow_up_is_a_step_failure(integrator, damping, dt):
     with refused(vp.StepFailure, "runs away") as caught:
         vp.simulate(scene, np.full(3, 0.4), np.zeros(3), dt=dt, steps=10_000, integrator=integrator)
     assert "mass matrix" not in str(caught.value)
+    assert ("Damping" in caught.value.advice) == (damping > 0.0)
     assert np.isfinite(caught.value.trajectory.energy).all()

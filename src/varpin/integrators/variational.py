@@ -10,27 +10,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.core import (
-    Guards,
-    Outcome,
-    Parameters,
-    Rollout,
-    Steps,
-    filter_variational,
-)
+from varpin.core import Guards, Outcome, Parameters, Rollout, Steps, filter_variational
 from varpin.core.arrays import FilterArrays, FilterLog, RolloutArrays
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
-from varpin.integrators.base import (
-    Integrator,
-    Run,
-    Segment,
-    Varied,
-    drifts,
-    forces,
-    gear,
-    without_inputs,
-    written,
-)
+from varpin.integrators.base import Integrator, Run, Segment, Varied, drifts, forces, gears, without_inputs, written
 from varpin.integrators.tableau import Scheme
 from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.scene import Scene, refuse_constraints
@@ -200,9 +183,8 @@ class Variational(Integrator):
 
     def in_parameters(self, scene: Scene, trajectory: Trajectory, varied: Sequence[Varied]) -> Floats:
         pairs = [(each.above.core, each.below.core) for each in varied]
-        gears = np.array([[gear(scene, each.above), gear(scene, each.below)] for each in varied])
         distance = np.array([each.distance for each in varied])
-        return self._derivatives(scene, trajectory, parameters=Parameters(pairs, distance, gears))[3]
+        return self._derivatives(scene, trajectory, parameters=Parameters(pairs, distance, gears(scene, varied)))[3]
 
     def _kicks(self, scene: Scene, trajectory: Trajectory, Jx: Floats, Jf: Floats) -> Floats:
         """The derivatives in the noise impulse, from those in the state and in a constant force."""

@@ -45,26 +45,16 @@ def damping_matrices(scene: Scene, q: Floats, v: Floats, forces: Floats, *, cust
     return D
 
 
-def _definite(matrices: Floats) -> bool:
-    """Whether all of some symmetric matrices (K, n, n) are positive definite."""
-    try:
-        np.linalg.cholesky(matrices)
-    except np.linalg.LinAlgError:
-        return False
-    return True
-
-
 def fastest_damping(scene: Scene, q: Floats, v: Floats, forces: Floats, least: float) -> float:
     """The largest rate of damping [1/s] at states q, v (K, n) under constant forces (K, n); 0 if below ``least``."""
-    M, D = masses(scene, q), damping_matrices(scene, q, v, forces, custom=True)
-    if _definite(least * M - D):
-        return 0.0
     try:
-        root = np.linalg.cholesky(M)
+        root = np.linalg.cholesky(masses(scene, q))
+        D = damping_matrices(scene, q, v, forces, custom=True)
+        white = np.linalg.solve(root, np.swapaxes(np.linalg.solve(root, D), 1, 2))
+        rate = float(np.linalg.eigvalsh(white).max())
     except np.linalg.LinAlgError:
         return math.inf
-    white = np.linalg.solve(root, np.swapaxes(np.linalg.solve(root, D), 1, 2))
-    return float(np.linalg.eigvalsh(white).max())
+    return rate if rate > least else 0.0
 
 
 def pulls_fast(scene: Scene, q: Floats, forces: Floats, dt: float) -> bool:
@@ -75,7 +65,7 @@ def pulls_fast(scene: Scene, q: Floats, forces: Floats, dt: float) -> bool:
     if scene.couplings:
         slopes = scene.core.coupled_forces(q, still)[1]
         K += 0.5 * (slopes + np.swapaxes(slopes, 1, 2))
-    return not _definite(masses(scene, q) + dt * dt * np.array([K, -K]))
+    return bool(np.linalg.eigvalsh(masses(scene, q) + dt * dt * np.array([K, -K])).min() <= 0.0)
 
 
 def rate_at_rest(scene: Scene, q: Floats) -> float:
