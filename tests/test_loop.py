@@ -358,9 +358,7 @@ def test_the_sentence(caplog):
     assert not any(told(run(PENDULUM, [0], [0], pd(10.0, 1.0), dt=1e-3, steps=steps)) for steps in range(6))
 
 
-@pytest.mark.parametrize(
-    ("kp", "kd", "dt", "failed"), [(1e5, 1e3, 5e-3, 2), (1e5, 0, 1 / 30, 1), (1e6, 1e3, 1 / 30, 0)]
-)
+@pytest.mark.parametrize(("kp", "kd", "dt", "failed"), [(3e4, 300, 5e-3, 3), (1e5, 1e3, 5e-3, 1), (1e5, 0, 1 / 30, 0)])
 def test_a_step_that_fails_under_a_law_has_the_judgement_of_its_loop(kp, kd, dt, failed):
     with refused(vp.StepFailure, "unstable at its period") as caught:
         vp.simulate(TWO, [0, 0], [0, 0], dt=dt, steps=400, controls=pd(kp, kd))

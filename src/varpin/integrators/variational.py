@@ -31,7 +31,7 @@ _UNCHECKED = 1e300
 _SHIFT = 2.5e-4
 
 REASONS: dict[int, str] = {
-    Outcome.diverged: "Newton's iteration does not contract, however small the substep",
+    Outcome.diverged: "Newton's iteration does not contract, in parts of the step either",
     Outcome.not_finite: "the step equation gives values that are not finite",
     Outcome.fold: "the step is at a fold of the step equation's solutions (its branch margin is not positive)",
     Outcome.energy: "the energy balance of the step does not close",
@@ -55,7 +55,7 @@ class Guard:
         energy_budget: Largest sum of these errors over all substeps, relative to the largest kinetic energy so far
             (plus the work done by forces). The closer the sum is to the budget, the smaller the errors of the same sign
             that are accepted.
-        max_halvings: Most halvings of a step, at most 30: a step has at most 2**max_halvings parts.
+        max_halvings: Most halvings of a step, at most 30. A step has at most 256 parts, however short.
 
     Raises:
         InputError: A value is out of its range.

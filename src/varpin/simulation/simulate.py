@@ -115,10 +115,8 @@ def simulate(
         ToleranceError: No step brings the error below 1 rad or m, as in a chaotic motion over a long time.
         UnknownJoint: ``q0`` or ``v0`` names a joint that is no coordinate of the robot, or ``controls`` one that no
             control drives.
-        ControlError: The control function failed; holds the trajectory so far.
-        NoiseError: A function of a CustomNoise failed; holds the trajectory so far.
-        ForceError: A function of a CustomForce failed; holds the trajectory so far.
-        ConstraintError: A function of a CustomConstraint failed; holds the trajectory so far.
+        ControlError, NoiseError, ForceError, ConstraintError: A function of controls, a CustomNoise, a CustomForce or
+            a CustomConstraint failed; holds the trajectory so far.
         StepFailure: A step has no trustworthy solution; holds the trajectory so far.
         SingularMassMatrix: M(q0) is not positive definite.
         AssemblyError: The scene's constraints cannot be kept near q0.
