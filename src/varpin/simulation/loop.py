@@ -122,19 +122,18 @@ def unstable_loop(
     of if the loop is unstable at most of some states spread over the motion, or over the turns of a control.
     """
     period, at = hold * trajectory.dt, np.arange(0, trajectory.steps, hold)
-    if short := len(at) < 3:
+    if len(at) >= 3:
+        u = trajectory.u[at]
+        if not np.ptp(u, axis=0).any():
+            return ()
+    elif callable(law):
         # Of a motion that fails at once, the state at its start stands for its neighbours, too.
         at = np.zeros(3, dtype=np.int64)
-    x = np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1)
-    t: Floats = period * np.arange(len(at), dtype=np.float64)
-    if trajectory.steps:
-        u = trajectory.u[at]
-    elif callable(law):
-        u = np.repeat(decision(law(), scene, 0, 0.0, *np.split(x[0], 2)), 3, axis=0)
+        u = np.repeat(decision(law(), scene, 0, 0.0, trajectory.q[0], trajectory.v[0]), 3, axis=0)
     else:
         return ()
-    if not (short or np.ptp(u, axis=0).any()):
-        return ()
+    x = np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1)
+    t: Floats = period * np.arange(len(at), dtype=np.float64)
     worst, turning = _turning(u)
     groups = [_spread(nodes) for nodes in (_inside(u), turning)]
     with np.errstate(all="ignore"), one_thread():
