@@ -153,20 +153,18 @@ def test_chaos(robot, height, steps):
 def test_of_falls_whose_deviations_grow_a_step_is_named_that_follows_them_or_a_shorter_duration(name):
     scene, start = fall(vp.load_robot(name), 0.3)
     (told,) = about(moved(scene, steps=100, start=start).warnings, "error")
-    stages, dt, growth = re.search(
-        r"Gauss\((\d)\) and dt = (\S+) s, as deviations grow more than (\S+)-fold", told
-    ).groups()
+    stages, dt = re.search(r"Gauss\((\d)\) and dt = (\S+) s", told).groups()
     step = {"dt": float(dt), "duration": 2.0, "integrator": vp.Gauss(int(stages))}
     motion = vp.simulate(scene, *start, **step)
     assert not about(motion.warnings, "error")
     apart = np.abs(vp.simulate(scene, start[0] + 1e-12, start[1], **step).q - motion.q).max(axis=1)
     right = round(told.time / motion.dt)
-    assert apart.max() > float(growth) * apart[:right].max()
+    assert apart.max() > 1e4 * apart[:right].max()
     (told,) = about(moved(scene, steps=500, start=start).warnings, "error")
     assert "and a shorter duration, as even rounding errors grow" in told
 
 
-def test_swings_are_not_called_sensitive():
+def test_of_swings_no_rounding_is_told():
     (told,) = about(moved(FREE, MIDPOINT, dt=0.05, steps=2000, start=([2.0, 0.0, 0.0], np.zeros(3))).warnings, "error")
     assert told.value > 0.1
     assert "grow" not in told

@@ -177,7 +177,7 @@ def test_what_is_wrong_and_unsaid_is_silent_wrong(monkeypatch):
     assert cell.kind is Kind.WRONG
     assert "error" in cell.found[0]
     found = (Finding("test", "all is not well"),)
-    monkeypatch.setattr("varpin.simulation.simulate.checked", lambda *given, **_: given[2].changed(warnings=found))
+    monkeypatch.setattr("varpin.simulation.simulate.checked", lambda case, _: case.trajectory.changed(warnings=found))
     assert run_one(lie).kind is Kind.DEGRADED
 
 

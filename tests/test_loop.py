@@ -386,9 +386,13 @@ def test_the_sentence(caplog):
     assert not any(told(run(PENDULUM, [0], [0], pd(10.0, 1.0), dt=1e-3, steps=steps)) for steps in range(6))
 
 
-def test_a_step_that_fails_under_a_law_names_its_gains():
-    with refused(vp.StepFailure, "lower gains"):
-        vp.simulate(TWO, [0, 0], [0, 0], dt=5e-3, steps=400, controls=pd(1e5, 1e3))
+@pytest.mark.parametrize(("kp", "kd", "dt", "failed"), [(3e4, 300, 5e-3, 3), (1e5, 1e3, 5e-3, 1), (1e5, 0, 1 / 30, 0)])
+def test_a_step_that_fails_under_a_law_has_the_judgement_of_its_loop(kp, kd, dt, failed):
+    with refused(vp.StepFailure, "unstable at its period") as caught:
+        vp.simulate(TWO, [0, 0], [0, 0], dt=dt, steps=400, controls=pd(kp, kd))
+    assert caught.value.step == failed
+    size = radius(TWO, np.hstack([-kp * np.eye(2), -kd * np.eye(2)]), dt, np.ones(2))
+    assert caught.value.trajectory.warnings[0].value == pytest.approx(size, rel=1e-6)
 
 
 def test_an_ensemble_whose_loop_is_unstable_says_so():

@@ -318,6 +318,15 @@ def test_gains_that_are_too_high_for_the_plant_are_told_of(rotors, unstable, noi
         assert about(caught.value.trajectory.warnings, "unstable loop")
 
 
+def test_of_a_coarse_plant_the_substeps_are_named_that_cure_it():
+    scene = vp.Scene(slider(), stiffness=900.0, gravity=False, noise=vp.AdditiveNoise(0.01))
+
+    def told(substeps):
+        return about(vp.Mpc(cart()).run(vp.Plant(scene, substeps=substeps), duration=0.5, rng=1).warnings, "error")
+
+    assert not told(int(told(2)[0].split("Use Plant(substeps=")[1].rstrip(")")))
+
+
 # --- within constraints ----------------------------------------------------------------------------------------------
 
 

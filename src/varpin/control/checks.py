@@ -28,7 +28,7 @@ from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import closest_controls
 from varpin.model import in_degrees, joint_unit
 from varpin.model.kinematics import FrameKinematics, reach
-from varpin.simulation.check import check
+from varpin.simulation.check import Case, check
 from varpin.simulation.record import rollout
 from varpin.simulation.start import start_in_degrees
 from varpin.simulation.velocity_noise import wrong_spread
@@ -54,7 +54,7 @@ def looked_at(solution: Solution) -> Solution:
 def findings(solution: Solution) -> tuple[Finding, ...]:
     """Findings about a plan: its limits, its noise, and its cost and constraints within steps."""
     problem, motion = solution.problem, solution.trajectory
-    of_motion = check(problem.scene, problem.integrator, motion, solution.policy).warnings
+    of_motion = check(Case(problem.scene, problem.integrator, motion, solution.policy)).warnings
     found = [*foreseen(problem), *(finding for finding in of_motion if finding.kind != "error")]
     met = solution.refinement is not None and solution.refinement.met
     if solution.refinement is not None and not met:

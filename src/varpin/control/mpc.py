@@ -30,7 +30,7 @@ from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import generator
 from varpin.signals.commands import in_parts_of_steps, on_lines, with_ends
-from varpin.simulation.check import check
+from varpin.simulation.check import Case, check
 from varpin.simulation.choice import given_integrator, usual_integrator
 from varpin.simulation.failures import Interrupted, StepFailure
 from varpin.simulation.limits import beyond_limits
@@ -303,12 +303,14 @@ class Mpc:
             if isinstance(cause, CostError):
                 raise CostError(cause.cost, cause.problem, loop.told(error.trajectory)) from cause
             raise cause or error from None
-        except (StepFailure, Interrupted) as error:
+        except StepFailure as error:
+            raise error.along(loop.told(error.trajectory), "Use more Plant(substeps=)") from None
+        except Interrupted as error:
             error.trajectory = loop.told(error.trajectory)
             raise
         loop.report(motion.t[-1], motion.q[-1], motion.v[-1])
         # The controller corrects the errors of a tick in the next.
-        motion = check(scene, method, motion.changed(warnings=()), restart=plant.substeps)
+        motion = check(Case(scene, method, motion.changed(warnings=()), restart=plant.substeps))
         constraints, violated = loop.constraints(motion)
         found = (
             *noise_forgotten(scene, rng),

@@ -24,7 +24,7 @@ from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.scene import Scene
 from varpin.mechanics.wiener import Children
 from varpin.signals.commands import as_moved, lines, rows, with_ends
-from varpin.simulation.check import check
+from varpin.simulation.check import Case, check
 from varpin.simulation.loop import Gains, unstable_loop
 from varpin.simulation.record import Motions
 from varpin.support.checks import told_motion
@@ -193,7 +193,8 @@ def examine(task: tuple[Shared, int, Floats, Floats]) -> tuple[Finding, ...]:
     held = len(shared.commands.gains) and not shared.linear
     gains = Gains(shared.commands.gains, shared.scene if shared.integrator.variational else None)
     loop = unstable_loop(shared.scene, motion, shared.commands.hold, gains) if held else ()
-    return (*loop, *check(shared.scene, shared.integrator, motion, shared.commands if held else None).warnings)
+    case = Case(shared.scene, shared.integrator, motion, shared.commands if held else None)
+    return (*loop, *check(case).warnings)
 
 
 class Paths(ABC):

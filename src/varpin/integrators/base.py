@@ -18,7 +18,7 @@ from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.mechanics.noise import Fields, ito_drift, over_steps
 from varpin.mechanics.scene import Scene
 from varpin.signals.commands import contiguous, steps_of, with_ends
-from varpin.trajectory import StepStatistics, Trajectory, joined
+from varpin.trajectory import STEP_NUMBERS, StepStatistics, Trajectory, joined
 
 # Fields of a segment with one row for each node.
 _ARRAYS = ("q", "p", "v", "u", "energy")
@@ -300,14 +300,8 @@ def written(made: object, named: Sequence[str] = ()) -> str:
 
 
 def _text(value: object) -> str:
-    """A value as Python reads it; a number with as few digits as restore it exactly."""
-    if isinstance(value, str):
-        return f'"{value}"'
-    if isinstance(value, (float, np.floating)):
-        number = float(value)
-        short = f"{number:g}"
-        return short if float(short) == number else repr(number)
-    return repr(value) if is_dataclass(value) else str(value)
+    """A value as Python reads it."""
+    return f'"{value}"' if isinstance(value, str) else str(value)
 
 
 def join(segments: Sequence[Segment]) -> Segment:
@@ -366,10 +360,11 @@ def forces(scene: Scene, trajectory: Trajectory, drift: Floats | float = 0.0) ->
     return (u if scene.direct else u @ scene.actuation.T) + drift
 
 
-def gear(scene: Scene, other: Scene) -> Floats:
-    """Factors (n,) by which the controls of ``scene`` exert more force in the ``other``, whose servos are stiffer."""
-    before, after = (np.abs(each.actuation).sum(axis=1) for each in (scene, other))
-    factors: Floats = np.divide(after, before, out=np.ones_like(before), where=before > 0.0)
+def gears(scene: Scene, varied: Sequence[Varied]) -> Floats:
+    """Factors (P, 2, n) by which controls of ``scene`` exert more force in other scenes, whose servos are stiffer."""
+    others = np.array([[each.above.actuation, each.below.actuation] for each in varied])
+    before, after = (np.abs(each).sum(axis=-1) for each in (scene.actuation, others))
+    factors: Floats = np.divide(after, before, out=np.ones_like(after), where=before > 0.0)
     return factors
 
 
@@ -382,16 +377,10 @@ def segments_of(nodes: RolloutArrays, reasons: Mapping[int, str], paths: Any = N
     for i, done in enumerate(nodes.done.tolist()):
         tally, quality, ended = nodes.tally[i, :done], nodes.quality[i, :done], int(nodes.ended[i])
         split = done > 0 and tally[:, 3].max() > 1
-        statistics = StepStatistics(
-            newton_iterations=tally[:, 0],
-            jets=tally[:, 1],
-            sweeps=tally[:, 2],
-            substeps=tally[:, 3],
-            halvings=paths.halvings(i) if split else np.zeros(0, dtype=np.uint8),
-            residual=quality[:, 0],
-            branch_margin=quality[:, 1],
-            energy_defect=quality[:, 2],
-        )
+        halvings = paths.halvings(i) if split else np.zeros(0, dtype=np.uint8)
+        # The core writes the numbers in the order of the fields.
+        numbers = dict(zip(STEP_NUMBERS, (*tally.T, *quality.T), strict=True))
+        statistics = StepStatistics(**numbers, halvings=halvings)
         own = {name: getattr(nodes, name)[i, :done] for name in _ARRAYS}
         failure = Failure(reasons[ended], float(nodes.quality[i, done, 0])) if ended in reasons else None
         segments.append(Segment(**own, statistics=statistics, failure=failure))

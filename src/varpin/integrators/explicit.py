@@ -14,18 +14,12 @@ from varpin.arrays import Floats
 from varpin.core import ExplicitMethod, Mechanism, Outcome
 from varpin.core.arrays import FilterArrays, FilterLog
 from varpin.errors import LinearizationError
-from varpin.integrators.base import (
-    Integrator,
-    Run,
-    Varied,
-    drifts,
-    forces,
-)
+from varpin.integrators.base import Integrator, Run, Varied, drifts, forces
 from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.trajectory import Trajectory
 
 REASONS: dict[int, str] = {
-    Outcome.not_finite: "the state is no longer finite: the motion runs away, as where damping is faster than the step",
+    Outcome.not_finite: "the state is no longer finite: the motion runs away",
     Outcome.singular: "the mass matrix is not positive definite",
 }
 

@@ -10,27 +10,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.core import (
-    Guards,
-    Outcome,
-    Parameters,
-    Rollout,
-    Steps,
-    filter_variational,
-)
+from varpin.core import Guards, Outcome, Parameters, Rollout, Steps, filter_variational
 from varpin.core.arrays import FilterArrays, FilterLog, RolloutArrays
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
-from varpin.integrators.base import (
-    Integrator,
-    Run,
-    Segment,
-    Varied,
-    drifts,
-    forces,
-    gear,
-    without_inputs,
-    written,
-)
+from varpin.integrators.base import Integrator, Run, Segment, Varied, drifts, forces, gears, without_inputs, written
 from varpin.integrators.tableau import Scheme
 from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.scene import Scene, refuse_constraints
@@ -48,7 +31,7 @@ _UNCHECKED = 1e300
 _SHIFT = 2.5e-4
 
 REASONS: dict[int, str] = {
-    Outcome.diverged: "Newton's iteration does not contract, however small the substep",
+    Outcome.diverged: "Newton's iteration does not contract, in parts of the step either",
     Outcome.not_finite: "the step equation gives values that are not finite",
     Outcome.fold: "the step is at a fold of the step equation's solutions (its branch margin is not positive)",
     Outcome.energy: "the energy balance of the step does not close",
@@ -72,7 +55,7 @@ class Guard:
         energy_budget: Largest sum of these errors over all substeps, relative to the largest kinetic energy so far
             (plus the work done by forces). The closer the sum is to the budget, the smaller the errors of the same sign
             that are accepted.
-        max_halvings: Most halvings of a step, at most 30: a step has at most 2**max_halvings parts.
+        max_halvings: Most halvings of a step, at most 30. A step has at most 256 parts, however short.
 
     Raises:
         InputError: A value is out of its range.
@@ -200,9 +183,8 @@ class Variational(Integrator):
 
     def in_parameters(self, scene: Scene, trajectory: Trajectory, varied: Sequence[Varied]) -> Floats:
         pairs = [(each.above.core, each.below.core) for each in varied]
-        gears = np.array([[gear(scene, each.above), gear(scene, each.below)] for each in varied])
         distance = np.array([each.distance for each in varied])
-        return self._derivatives(scene, trajectory, parameters=Parameters(pairs, distance, gears))[3]
+        return self._derivatives(scene, trajectory, parameters=Parameters(pairs, distance, gears(scene, varied)))[3]
 
     def _kicks(self, scene: Scene, trajectory: Trajectory, Jx: Floats, Jf: Floats) -> Floats:
         """The derivatives in the noise impulse, from those in the state and in a constant force."""

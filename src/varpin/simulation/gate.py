@@ -18,15 +18,15 @@ from varpin.integrators import Integrator, Reference
 from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import Scene
 from varpin.signals.commands import Times, interpolation
-from varpin.simulation.spectrum import fastest_damping, speed_scales, travel_scales
+from varpin.simulation.spectrum import fastest_rate, speed_scales, travel_scales
 from varpin.trajectory import Trajectory
 
 # Largest propagated errors of q and v of a motion that is let pass, as shares of the travel and of the largest speed: a
 # third of what is told of. Of 2142 random motions 2.7 % had a true error above four times the propagated one, in fast
 # chaotic ones up to 64 times, and none above 1 % of the travel.
 _TRAVEL, _SPEED, _SURE = 3e-3, 0.05, 4.0
-# Rates of dampers along single steps, in units of 1 / dt, and the number of nodes at which they are looked at.
-_RATE, _DAMPERS = 1.8, 6
+# Rate of dampers along single steps, in units of 1 / dt, beyond which what is left of a step does not tell its error.
+_RATE = 1.8
 # Largest change of dry friction in a step, as a share of its level.
 _TURNS = 0.25
 # Most joints: linearizations of more take longer than the motion.
@@ -62,18 +62,10 @@ def proven_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     )
     damped = bool(scene.elements)
     largest = float(propagate(damped=damped).max(initial=0.0))
-    if damped and not math.isfinite(largest) and not _damped(scene, trajectory):
-        largest = float(propagate(damped=False).max(initial=0.0))
+    if damped and not math.isfinite(largest):
+        rate = fastest_rate(scene, trajectory.q, trajectory.v, trajectory.u, _RATE / trajectory.dt)
+        largest = largest if rate else float(propagate(damped=False).max(initial=0.0))
     return _SURE * largest if math.isfinite(largest) else None
-
-
-def _damped(scene: Scene, trajectory: Trajectory) -> bool:
-    """Whether a damper may be faster than the step; between the nodes, dry friction may be any damper."""
-    if of_kind(scene.elements, "CoulombFriction"):
-        return True
-    at = np.linspace(0, trajectory.steps, _DAMPERS).astype(np.int64)
-    forces = trajectory.u[np.minimum(at, trajectory.steps - 1)] @ scene.actuation.T
-    return fastest_damping(scene, trajectory.q[at], trajectory.v[at], forces, _RATE / trajectory.dt) > 0.0
 
 
 def _turns_over(scene: Scene, trajectory: Trajectory) -> bool:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from varpin.arrays import Floats, Mask
+from varpin.arrays import Floats
 from varpin.finding import Finding, and_more
 from varpin.mechanics.forces import drive_forces, limited_servos, of_kind
 from varpin.mechanics.scene import Scene
@@ -31,28 +31,20 @@ def beyond_limits(scene: Scene, trajectory: Trajectory, extremes: Floats | None 
         cure = "constraints='robot'" if scene.robot.equalities else f"constraints=[varpin.PointOnPoint({a!r}, {b!r})]"
         text = f"the robot's loop of {a!r} on {b!r} is open{and_more(len(loops) - 1, 'loop')}: the motion is a tree's. "
         found.append(Finding("open loops", f"{text}Use varpin.Scene(robot, {cure})"))
-    bounded: Mask = np.asarray(np.isfinite(scene.bounds).any(axis=(1, 2)))
-    if not bounded.any():
-        return found
-    q, v = trajectory.q, trajectory.v
-    for kind, (least, most) in enumerate(scene.bounds):
-        if not bounded[kind]:
-            continue
-        values = (q, v, _efforts(scene, trajectory, extremes) if kind == 2 else v)[kind]
-        with np.errstate(invalid="ignore"):
-            excess = np.maximum(least - values, values - most)
-            excess = np.where(excess > _ROUNDING * (most if kind else 1.0), excess, -np.inf)
-        worst = excess.max(axis=0, initial=-np.inf)
-        if worst.max() > 0.0:
-            found.append(_passed(scene, trajectory, kind, values, excess, (least, most)))
-    return found
+    kinds = np.flatnonzero(np.isfinite(scene.bounds).any(axis=(1, 2)))
+    return found + [each for kind in kinds for each in _passed(scene, trajectory, int(kind), extremes)]
 
 
-def _passed(
-    scene: Scene, trajectory: Trajectory, kind: int, values: Floats, excess: Floats, limits: tuple[Floats, Floats]
-) -> Finding:
-    """The finding about one kind of limits: the joint with the largest ``excess`` (K, n), and when."""
-    worst = excess.max(axis=0)
+def _passed(scene: Scene, trajectory: Trajectory, kind: int, extremes: Floats | None) -> list[Finding]:
+    """The finding about one kind of limits: the joint that passes its own by most, and when."""
+    values = (trajectory.q, trajectory.v)[kind] if kind < 2 else _efforts(scene, trajectory, extremes)
+    limits = least, most = scene.bounds[kind]
+    with np.errstate(invalid="ignore"):
+        excess = np.maximum(least - values, values - most)
+        excess = np.where(excess > _ROUNDING * (most if kind else 1.0), excess, -np.inf)
+    worst = excess.max(axis=0, initial=-np.inf)
+    if not worst.max() > 0.0:
+        return []
     joint = int(worst.argmax())
     name, peak = scene.robot.joint_names[joint], int(excess[:, joint].argmax())
     unit = _UNITS[kind][int(scene.robot.slides[joint])]
@@ -69,7 +61,7 @@ def _passed(
         f"joint {name!r} passes its {what} limit {limit:.4g} {unit} by up to {by:.3g} "
         f"(t = {trajectory.t[peak]:.3g} s{soft}){and_more(int((worst > 0).sum()) - 1, 'joint')}"
     )
-    return Finding(KINDS[kind], text, name, time=float(trajectory.t[peak]), value=float(by), unit=unit)
+    return [Finding(KINDS[kind], text, name, time=float(trajectory.t[peak]), value=float(by), unit=unit)]
 
 
 def _efforts(scene: Scene, trajectory: Trajectory, extremes: Floats | None) -> Floats:

@@ -27,7 +27,7 @@ from varpin.finding import Finding
 from varpin.integrators.explicit import accelerations
 from varpin.mechanics.assembly import nearest
 from varpin.mechanics.scene import Scene, closest_controls, tangent_basis
-from varpin.signals.functions import Copies
+from varpin.signals.functions import Copies, decision
 from varpin.signals.responses import MEMORY, Response, responses
 from varpin.simulation.spectrum import masses
 from varpin.support.one_thread import one_thread
@@ -122,9 +122,18 @@ def unstable_loop(
     of if the loop is unstable at most of some states spread over the motion, or over the turns of a control.
     """
     period, at = hold * trajectory.dt, np.arange(0, trajectory.steps, hold)
-    t, u, x = trajectory.t[at], trajectory.u[at], np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1)
-    if len(at) < 3 or not np.ptp(u, axis=0).any():
+    if len(at) >= 3:
+        u = trajectory.u[at]
+        if not np.ptp(u, axis=0).any():
+            return ()
+    elif callable(law):
+        # Of a motion that fails at once, the state at its start stands for its neighbours, too.
+        at = np.zeros(3, dtype=np.int64)
+        u = np.repeat(decision(law(), scene, 0, 0.0, trajectory.q[0], trajectory.v[0]), 3, axis=0)
+    else:
         return ()
+    x = np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1)
+    t: Floats = period * np.arange(len(at), dtype=np.float64)
     with np.errstate(all="ignore"), one_thread():
         worst, turning = _turning(u)
         groups = [_spread(nodes) for nodes in (_inside(u), turning)]

@@ -21,6 +21,7 @@ from varpin.signals.commands import open_loop
 from varpin.signals.controls import Controls, commands_of
 from varpin.signals.functions import ControlLaw, Sampled, copier, function_findings, require_law
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
+from varpin.simulation.check import Case
 from varpin.simulation.check import check as checked
 from varpin.simulation.choice import given_integrator, usual_integrator
 from varpin.simulation.failures import Interrupted, StepFailure, named
@@ -114,10 +115,8 @@ def simulate(
         ToleranceError: No step brings the error below 1 rad or m, as in a chaotic motion over a long time.
         UnknownJoint: ``q0`` or ``v0`` names a joint that is no coordinate of the robot, or ``controls`` one that no
             control drives.
-        ControlError: The control function failed; holds the trajectory so far.
-        NoiseError: A function of a CustomNoise failed; holds the trajectory so far.
-        ForceError: A function of a CustomForce failed; holds the trajectory so far.
-        ConstraintError: A function of a CustomConstraint failed; holds the trajectory so far.
+        ControlError, NoiseError, ForceError, ConstraintError: A function of controls, a CustomNoise, a CustomForce or
+            a CustomConstraint failed; holds the trajectory so far.
         StepFailure: A step has no trustworthy solution; holds the trajectory so far.
         SingularMassMatrix: M(q0) is not positive definite.
         AssemblyError: The scene's constraints cannot be kept near q0.
@@ -171,14 +170,9 @@ def simulate(
     if not (callable(controls) or isinstance(controls, Sampled)):
         commands = commands_of(scene, integrator, controls, steps, dt)
     linear = len(commands.stage_times) > 0
-    # The check of a loop is for held controls.
-    hold = (
-        period
-        if law
-        else commands.hold
-        if isinstance(controls, LinearPolicy) and controls.gains.any() and not linear
-        else None
-    )
+    # The check of a loop is for held controls: commands have the period of a law, too.
+    feeds_back = law or (isinstance(controls, LinearPolicy) and controls.gains.any() and not linear)
+    hold = commands.hold if feeds_back else 0
     state, (start,) = integrator.start(scene, q0[None], v0[None])
     held = commands.hold > 1 and not law
     record = MotionRecord(scene, integrator, dt, dw, start, commands if linear else None, held=held)
@@ -193,8 +187,8 @@ def simulate(
         if check:
             ended = interrupted and not isinstance(controls, Sampled)
             more = None if callable(controls) or ended else controls
-            motion = checked(scene, integrator, motion, more, known=known, hold=period if law else 0, law=kept)
-            unstable = () if loop is None else loop(motion)
+            motion = checked(Case(scene, integrator, motion, more, hold=period if law else 0, law=kept), known)
+            unstable = () if loop is None or steps <= 2 * hold else loop(motion)
             wrong = [finding for finding in motion.warnings if finding.kind == "error"]
             unsettled = function_findings(controls) if isinstance(controls, Sampled) else ()
             found = [*unstable, *wrong, *unsettled, *found, *motion.warnings]
@@ -243,10 +237,11 @@ def _roll(
 def _step_failure(record: MotionRecord, failure: Failure, loop: LoopCheck | None) -> StepFailure:
     """The error of a step that failed, its motion with a warning where an unstable control loop is the cause."""
     motion = record.trajectory()
-    found = () if loop is None else loop(motion)
-    motion = motion.changed(warnings=found)
-    advice = found[0] if found else "Use a smaller dt" if loop is None else "Use a smaller dt, or lower gains"
-    return StepFailure(motion.steps, motion.t[-1], named(record.scene, failure), motion, advice)
+    motion = motion.changed(warnings=() if loop is None else loop(motion))
+    # A function of the scene may fail where the motion runs away.
+    rings = "" if record.scene.custom else Case(record.scene, record.integrator, motion).rings
+    failure = named(record.scene, failure)
+    return StepFailure(motion.steps, motion.t[-1], failure, motion, rings or "Use a smaller dt")
 
 
 def noise_forgotten(

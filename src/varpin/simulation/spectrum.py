@@ -12,7 +12,7 @@ from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene, tangent_basis
 from varpin.model import longest_reach
 
-# Nodes at which rates along a motion are looked for, beside those where joints are slowest or in their stops.
+# Nodes at which rates along a motion are looked for, beside those where joints are deepest in their stops.
 _NODES = 12
 # Accumulated rounding, relative to positions.
 _ROUNDING = 1e3 * float(np.finfo(np.float64).eps)
@@ -45,26 +45,16 @@ def damping_matrices(scene: Scene, q: Floats, v: Floats, forces: Floats, *, cust
     return D
 
 
-def _definite(matrices: Floats) -> bool:
-    """Whether all of some symmetric matrices (K, n, n) are positive definite."""
-    try:
-        np.linalg.cholesky(matrices)
-    except np.linalg.LinAlgError:
-        return False
-    return True
-
-
 def fastest_damping(scene: Scene, q: Floats, v: Floats, forces: Floats, least: float) -> float:
     """The largest rate of damping [1/s] at states q, v (K, n) under constant forces (K, n); 0 if below ``least``."""
-    M, D = masses(scene, q), damping_matrices(scene, q, v, forces, custom=True)
-    if _definite(least * M - D):
-        return 0.0
     try:
-        root = np.linalg.cholesky(M)
+        root = np.linalg.cholesky(masses(scene, q))
+        D = damping_matrices(scene, q, v, forces, custom=True)
+        white = np.linalg.solve(root, np.swapaxes(np.linalg.solve(root, D), 1, 2))
+        rate = float(np.linalg.eigvalsh(white).max())
     except np.linalg.LinAlgError:
         return math.inf
-    white = np.linalg.solve(root, np.swapaxes(np.linalg.solve(root, D), 1, 2))
-    return float(np.linalg.eigvalsh(white).max())
+    return rate if rate > least else 0.0
 
 
 def pulls_fast(scene: Scene, q: Floats, forces: Floats, dt: float) -> bool:
@@ -75,7 +65,7 @@ def pulls_fast(scene: Scene, q: Floats, forces: Floats, dt: float) -> bool:
     if scene.couplings:
         slopes = scene.core.coupled_forces(q, still)[1]
         K += 0.5 * (slopes + np.swapaxes(slopes, 1, 2))
-    return not _definite(masses(scene, q) + dt * dt * np.array([K, -K]))
+    return bool(np.linalg.eigvalsh(masses(scene, q) + dt * dt * np.array([K, -K])).min() <= 0.0)
 
 
 def rate_at_rest(scene: Scene, q: Floats) -> float:
@@ -108,21 +98,15 @@ def natural_rate(scene: Scene, q: Floats, u: Floats) -> float:
 def fastest_rate(scene: Scene, q: Floats, v: Floats, u: Floats, least: float) -> float:
     """The fastest rate of damping along a motion q, v (N + 1, n), u (N, m) [1/s]; 0 if none is faster than ``least``.
 
-    It is looked for at some nodes, where dry friction is steepest, as joints come to rest or turn back, and in the
-    stops that joints reach.
+    It is looked for at some nodes and in the stops that joints reach, with dry friction where it is steepest, as joints
+    come to rest or turn back.
     """
     if not scene.dissipates or not len(u):
         return 0.0
-    slowest = [
-        (own.coordinate, int(np.abs(v[:, own.coordinate]).argmin()))
-        for own in of_kind(scene.elements, "CoulombFriction")
-    ]
-    even = np.linspace(0, len(u), _NODES).astype(np.int64)
-    at = np.array([*even, *_deepest(scene, q), *(node for _, node in slowest)])
+    at = np.array([*np.linspace(0, len(u), _NODES).astype(np.int64), *_deepest(scene, q)])
     speeds = v[at]
-    for row, (c, _) in enumerate(slowest, len(at) - len(slowest)):
-        if v[:, c].min() < 0.0 < v[:, c].max():
-            speeds[row, c] = 0.0
+    for c in (own.coordinate for own in of_kind(scene.elements, "CoulombFriction")):
+        speeds[:, c] = 0.0 if v[:, c].min() < 0.0 < v[:, c].max() else np.abs(v[:, c]).min()
     return fastest_damping(scene, q[at], speeds, u[np.minimum(at, len(u) - 1)] @ scene.actuation.T, least)
 
 

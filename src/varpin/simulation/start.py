@@ -88,8 +88,13 @@ def time_steps(
     return dt, steps
 
 
-def finer(trajectory: Trajectory, parts: int) -> tuple[int, str]:
-    """At least so many parts of a motion's steps, and the argument that asks for them: a short dt, or else steps."""
+def finer(trajectory: Trajectory, parts: int, substeps: int = 0) -> tuple[int, str]:
+    """At least so many parts of a motion's steps, and the argument that asks for them: a short dt, or else steps.
+
+    The argument is a plant's where the motion has so many ``substeps`` in each tick of a controller.
+    """
+    if substeps:
+        return parts, f"Plant(substeps={substeps * parts})"
     for more in range(parts, 2 * parts + 1):
         dt = trajectory.dt / more
         if math.isclose(float(f"{dt:.4g}"), dt, rel_tol=_MULTIPLE):

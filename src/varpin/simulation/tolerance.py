@@ -36,7 +36,7 @@ from varpin.signals.commands import held_in_parts
 from varpin.signals.controls import Controls, commands_of, control_rows
 from varpin.signals.functions import ControlLaw, Sampled
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
-from varpin.simulation.check import closer, distance, repeated, short_forces
+from varpin.simulation.check import Case
 from varpin.simulation.failures import ToleranceError
 from varpin.simulation.record import Motions
 from varpin.support.checks import positive
@@ -96,6 +96,15 @@ class Trial:
     cost: float
     whole: bool = True
     measured: bool = True
+
+
+def repeated(case: Case, cost: float) -> tuple[Trial, Floats]:
+    """A motion as a trial, and its error (N + 1, n), from its repetition."""
+    motion = case.trajectory
+    off, _ = case.errors(case.repeated())
+    largest = max(float(off.max()), ROUNDING * max(1.0, float(np.abs(motion.q).max())))
+    whole = motion.statistics.split_steps == 0
+    return Trial(case.integrator, motion.steps, largest if math.isfinite(largest) else math.inf, cost, whole), off
 
 
 class Rung:
@@ -330,11 +339,12 @@ class _Search:
             self.steps, self.evaluations = self.steps + motion.steps, self.evaluations + int(work)
             if failure is not None:
                 return Trial(integrator, steps, math.inf, float(work) * steps / max(motion.steps, 1))
-            if short_forces(self.scene, integrator, motion):
+            case = Case(self.scene, integrator, motion, controls)
+            if case.short_forces():
                 return Trial(integrator, steps, math.inf, float(work))
-            again = repeated(self.scene, integrator, motion, controls)
+            trial, self.errors[str(integrator), steps] = repeated(case, float(work))
             # Each step of a repetition takes about twice the evaluations.
-            parts = closer(self.scene, integrator, motion)[1]
+            parts = case.closer[1]
             self.steps, self.evaluations = self.steps + parts * steps, self.evaluations + 2 * parts * int(work)
         except (StepError, CustomForceError, CustomConstraintError) as error:
             # Coarse steps may go where the function is not defined.
@@ -344,12 +354,7 @@ class _Search:
                 raise max(self._raised, key=lambda each: getattr(each, "step", -1)) from error
             return Trial(integrator, steps, math.inf, float(steps))
         self._passed = True
-        off = distance(again, motion)[0]
-        floor = ROUNDING * max(1.0, float(np.abs(motion.q).max()))
-        self.errors[str(integrator), steps] = off
-        largest = max(float(off.max()), floor)
-        whole = motion.statistics.split_steps == 0
-        return Trial(integrator, steps, largest if math.isfinite(largest) else math.inf, float(work), whole=whole)
+        return trial
 
 
 def steps_for_tolerance(

@@ -27,8 +27,13 @@ _SLOWEST = 1e-6
 _NOTHING = 1e-12
 
 
-def wrong_spread(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """A warning if the noise of the scene gives a velocity a standard deviation that is off by more than a tenth."""
+def wrong_spread(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, smaller: str = "a smaller dt"
+) -> tuple[Finding, ...]:
+    """A warning if the noise of the scene gives a velocity a standard deviation that is off by more than a tenth.
+
+    ``smaller`` is what the caller gives for shorter steps.
+    """
     if not (scene.dissipates and scene.processes and trajectory.steps):
         return ()
     with np.errstate(all="ignore"):
@@ -39,7 +44,7 @@ def wrong_spread(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     if not off[joint] > _OFF:
         return ()
     other = Midpoint(kick="held")
-    cure = "a smaller dt" if integrator.same_map(other) else "integrator=varpin.Midpoint(kick='held')"
+    cure = smaller if integrator.same_map(other) else "integrator=varpin.Midpoint(kick='held')"
     name, share = trajectory.joint_names[joint], float(ratios[joint])
     text = (
         f"noise gives the velocity of joint {name!r} {share:.2g} times its standard deviation, as damping "

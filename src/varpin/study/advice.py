@@ -11,13 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-import numpy as np
-
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Reference
 from varpin.mechanics.scene import Scene
-from varpin.simulation.check import distance, repeated
-from varpin.simulation.tolerance import ROUNDING, Ladder, Trial, first_steps
+from varpin.simulation.check import Case
+from varpin.simulation.tolerance import Ladder, Trial, first_steps, repeated
 from varpin.study.motion import Setting, integrators_of
 from varpin.study.record import Study
 from varpin.support.checks import JointValues, positive
@@ -170,12 +168,9 @@ def advise(
 def _timed(setting: Setting, integrator: Integrator, steps: int) -> Trial:
     """A trial: its wall time, the best of several short ones, and its error, from its repetition."""
     outcome = setting.run(integrator, steps, repeats=_REPEATS, within=_TIMING)
-    motion, off = outcome.motion, math.inf
-    if not outcome.failure:
-        again = repeated(setting.scene, integrator, motion)
-        off = max(float(distance(again, motion)[0].max()), ROUNDING * max(1.0, float(np.abs(motion.q).max())))
-    whole = motion.statistics.split_steps == 0
-    return Trial(integrator, steps, off if math.isfinite(off) else math.inf, outcome.seconds, whole=whole)
+    if outcome.failure:
+        return Trial(integrator, steps, math.inf, outcome.seconds)
+    return repeated(Case(setting.scene, integrator, outcome.motion), outcome.seconds)[0]
 
 
 def _reason(
