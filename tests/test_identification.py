@@ -228,6 +228,10 @@ def test_ctrl_c_after_the_search_keeps_its_values(monkeypatch):
     assert np.isfinite(found.residuals[0]).all()
     monkeypatch.setattr("varpin.estimation.fit.Run.settled", interrupted)
     np.testing.assert_array_equal(vp.identify(start(), log(), NAMES, q_noise=NOISE).values, found.values)
+    turned = log()
+    turned = vp.Log(turned.t, turned.q, turned.u * [1, 1, 1, -1, 1, 1])
+    found = vp.identify(start(), turned, NAMES, q_noise=NOISE, evaluations=5)
+    assert naming(found.warnings, "times q_noise", "column"), found.warnings
 
 
 @pytest.mark.parametrize("searches", [0, 1])

@@ -37,12 +37,15 @@ _FIRST = 0.2
 # Expected decrease of the cost at which a first search ends, as a share of the cost, and the last one, as a share of
 # what one residual has in it: by a quarter of a deviation of a value. Where values are well told, the search is then
 # far closer, as it converges quadratically; inertias that logs hardly tell would go on for hundreds of evaluations.
-_LOOSE, _TIGHT = 1e-3, 0.05
+_LOOSE, _TIGHT = 0.01, 0.05
 # Most corrections of a stretch's start for given parameters, and the share of its cost below which it is found: later
 # evaluations go on from it.
 _CORRECTIONS, _FOUND = 6, 1e-8
 # Most trials of a correction, each a quarter as long: where dry friction turns, whole ones lead astray.
 _SHORTENED = 12
+# Most halvings of a step by a guard; from 3 to 5. Motions of values that are far off have steps of thousands of parts,
+# each with its derivatives, and are no nearer to the log.
+_HALVINGS = 4
 # Samples from which a stretch's start is guessed, by a parabola.
 _GUESSED = 8
 # Longest delay of the controls that is looked for [s]: buses and drives have some milliseconds.
@@ -73,6 +76,7 @@ class Fit:
     def __post_init__(self) -> None:
         if not self.horizon > 0.0:
             raise InputError(f"horizon must be positive [s], or np.inf for whole logs, got {self.horizon:g}")
+        self.integrator = self.integrator.halving(_HALVINGS)
         of, P, late = self.of, len(self.of.names), np.ones(int(self.delay is None))
         self.noise = of.scene.robot.joint_names, self.q_noise, self.v_noise
         self.bodies = _bodies(of)

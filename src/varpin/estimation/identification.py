@@ -347,10 +347,10 @@ def _step_error(fit: Fit, runs: Sequence[Run], y: Floats) -> Floats:
 
 def _doubts(fit: Fit, made: Identification, changes: Floats) -> Iterator[Finding]:
     """What is doubtful about the values, the worst first; ``changes`` (P,) are those by half the step."""
+    misfits = list(_misfit(fit, made))
     if fit.cost >= LOST**2:
         text = "motions with these values cannot be simulated: a column or its unit is wrong, or dt is too long"
-        yield Finding("lost", text)
-    misfits = list(_misfit(fit, made))
+        misfits = [Finding("lost", text)]
     yield from misfits
     by_noise = np.divide(np.abs(changes), made.deviations, out=np.zeros_like(changes), where=made.deviations > 0.0)
     k = int(np.argmax(by_noise))
@@ -386,13 +386,17 @@ def _misfit(fit: Fit, made: Identification) -> Iterator[Finding]:
     there = np.isfinite(squares)
     by_joint = np.sqrt(np.where(there, squares, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1))
     worst = int(np.argmax(by_joint))
-    if not by_joint[worst] <= _MISFIT:
-        joint = fit.of.scene.robot.joint_names[worst]
+    over, joint = float(by_joint[worst]), fit.of.scene.robot.joint_names[worst]
+    whose = f" of {joint!r}"
+    if not there.any():
+        # Ctrl-C came before the motions over the horizon: those of the search tell.
+        over, whose = float(np.sqrt(fit.cost / len(fit.jacobian))), ""
+    if not over <= _MISFIT:
         text = (
-            f"the residuals of {joint!r} are {by_joint[worst]:.3g} times q_noise: something acts that is no "
-            "parameter (friction, a payload elsewhere), or its column, clock or q_noise is wrong"
+            f"the residuals{whose} are {over:.3g} times q_noise: something acts that is no parameter (friction, a "
+            "payload elsewhere), or its column, clock or q_noise is wrong"
         )
-        yield Finding("misfit", text, joint, value=float(by_joint[worst]))
+        yield Finding("misfit", text, joint if whose else None, value=over)
 
 
 def _ended(fit: Fit) -> list[str]:
