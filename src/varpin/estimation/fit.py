@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -187,8 +187,9 @@ class Run:
     def __post_init__(self) -> None:
         self.grid = Grid.even(self.log, self.fit.dt)
         self.duration = float(self.log.t[-1] - self.log.t[0])
-        self.measured, variance = measurements(self.log, *self.fit.noise)
+        samples, variance = measurements(self.log, *self.fit.noise)
         self.deviation = np.sqrt(variance)
+        self.measured = samples / self.deviation
 
     def settled(self, scene: Scene, late: float) -> list[Stretch]:
         """The stretches after a search for their starts, by shorter ones as :func:`identify` where none is known."""
@@ -214,9 +215,11 @@ class Stretch:
     """Steps ``begin`` to ``end`` of a run, and the samples on them."""
 
     def __init__(self, run: Run, begin: int, end: int) -> None:
-        self.run, self.begin, self.end = run, begin, end
-        node, last = run.grid.node, end == run.grid.steps
+        self.run, self.begin, self.end = run, begin, min(end, run.grid.steps)
+        node, last = run.grid.node, self.end == run.grid.steps
         self.samples = (node >= begin) & ((node < end) | last)
+        self.there = np.isfinite(run.measured[self.samples])
+        self.measured = run.measured[self.samples][self.there]
         if begin not in run.starts:
             run.starts[begin] = self._guess()
 
@@ -247,12 +250,6 @@ class Stretch:
         curve, at = CubicHermiteSpline(np.arange(len(q)), q, h * v), grid.at[self.samples] - self.begin
         return curve(at), curve(at, 1) / h
 
-    @cached_property
-    def measured(self) -> Floats:
-        """The samples that are there (r,), in units of their deviations."""
-        samples = (self.run.measured / self.run.deviation)[self.samples]
-        return samples[np.isfinite(samples)]
-
     @np.errstate(over="ignore", invalid="ignore")
     def residuals(
         self, scene: Scene, varied: Sequence[Varied], delay: float, x0: Floats
@@ -276,8 +273,7 @@ class Stretch:
             return None
         state = np.concatenate([motion.q, motion.v], axis=1)[:, :, None]
         both = np.concatenate(self.at_samples(*np.split(np.concatenate([state, x], axis=2), 2, axis=1)), axis=1)
-        there = np.isfinite(self.run.measured[self.samples])
-        rows = (both[:, : there.shape[1]] / self.run.deviation[:, None])[there]
+        rows = (both[:, : self.there.shape[1]] / self.run.deviation[:, None])[self.there]
         r, J = rows[:, 0] - self.measured, rows[:, 1:]
         return (r, J[:, :m], J[:, m:]) if np.isfinite(np.vdot(J, J) + r @ r) else None
 
@@ -293,15 +289,12 @@ class Stretch:
             gain = 2.0 * float(step @ (Jx.T @ r)) - float(np.square(Jx @ step).sum())
             if gain <= _FOUND * float(r @ r):
                 break
-            for _ in range(_SHORTENED):
-                trial = self.residuals(scene, (), late, x0 - step)
-                if trial is not None and trial[0] @ trial[0] < r @ r:
-                    break
-                step = 0.25 * step
-            else:
+            starts = (x0 - 0.25**k * step for k in range(_SHORTENED))
+            trials = ((start, self.residuals(scene, (), late, start)) for start in starts)
+            nearer = next((each for each in trials if each[1] and each[1][0] @ each[1][0] < r @ r), None)
+            if nearer is None:
                 break
-            assert trial is not None
-            x0, found = x0 - step, trial
+            x0, found = nearer
         found = self.residuals(scene, varied, late, x0)
         if found is None:
             return np.full(self.measured.size, LOST), np.zeros((self.measured.size, len(varied) + 1))
