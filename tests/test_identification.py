@@ -10,7 +10,7 @@ from ur5_logs import DAMPING, MIDDLE, NAMES, NOISE, TRUTH, motion, start
 
 import varpin as vp
 from varpin.estimation.consistency import Body
-from varpin.estimation.fit import simulations
+from varpin.estimation.fit import Stretch, simulations
 from varpin.estimation.parameters import parameters_of
 
 
@@ -281,6 +281,21 @@ def test_dry_friction_leads_no_start_astray():
     )
     assert not found.warnings
     assert within(found, [0.5, 0.3, 0.3, 0.2])
+
+
+def test_steps_of_values_that_are_far_off_are_not_in_hundreds_of_parts(monkeypatch):
+    parts, whole = [], Stretch.motion
+
+    def counted(*given):
+        motion = whole(*given)
+        parts.append(0 if motion is None else motion.statistics.substeps.max(initial=1))
+        return motion
+
+    monkeypatch.setattr(Stretch, "motion", counted)
+    truth, begin = (vp.Scene(CHAIN, damping=damping) for damping in ([0.5, 0.3], 2e3))
+    found = vp.identify(begin, chain_log(truth), "damping", q_noise=1e-4, delay=0.0)
+    assert max(parts) <= 16
+    assert within(found, [0.5, 0.3])
 
 
 @pytest.mark.parametrize("begin", [(20.0, -1.0), (5.0, 0.0)])
