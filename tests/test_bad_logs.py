@@ -54,10 +54,9 @@ WARNED = {
     "columns in another order": (lambda t, q, u: (t, q[:, ORDER], u[:, ORDER]), ("column", "q_noise")),
     "an encoder that dies": (lambda t, q, u: (t, spoiled(q, np.s_[70:, 3], q[70, 3]), u), ("q_noise",)),
 }
-SLOW = ("columns in another order",)
 
 
-@pytest.mark.parametrize("what", [pytest.param(x, marks=[pytest.mark.slow] if x in SLOW else []) for x in WARNED])
+@pytest.mark.parametrize("what", WARNED)
 @pytest.mark.filterwarnings("error")
 def test_what_does_not_fit_is_told_first(what):
     each = found(*WARNED[what][0](*measured()), evaluations=5)
