@@ -1,6 +1,7 @@
 """Logs as they come from arms, with what is wrong with them: one clear error, a warning that fits, or right values."""
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from refusals import naming, refused
 from ur5_logs import NAMES, NOISE, TRUTH, motion, start
@@ -53,15 +54,20 @@ WARNED = {
     "columns in another order": (lambda t, q, u: (t, q[:, ORDER], u[:, ORDER]), ("column", "q_noise")),
     "an encoder that dies": (lambda t, q, u: (t, spoiled(q, np.s_[70:, 3], q[70, 3]), u), ("q_noise",)),
 }
-SLOW = ("columns in another order",)
 
 
-@pytest.mark.parametrize("what", [pytest.param(x, marks=[pytest.mark.slow] if x in SLOW else []) for x in WARNED])
+@pytest.mark.parametrize("what", WARNED)
 @pytest.mark.filterwarnings("error")
 def test_what_does_not_fit_is_told_first(what):
     each = found(*WARNED[what][0](*measured()), evaluations=5)
     assert naming(each.warnings[:1], *WARNED[what][1]), each.warnings
     assert np.abs(each.values / TRUTH - 1.0).max() > 0.02
+
+
+def wrong(log, scene):
+    """What is told of the order and the signs of columns."""
+    kinds = "sign of the controls", "order of the columns"
+    return [each for each in log.matched(scene).warnings if each.kind in kinds]
 
 
 TURNED = {
@@ -79,10 +85,41 @@ TURNED = {
 @pytest.mark.parametrize("what", TURNED)
 def test_turned_signs_are_told(what):
     joints, change = TURNED[what]
-    log = change(*measured()).matched(start())
-    told = [warning for warning in log.warnings if warning.kind == "sign of the controls"]
+    told = wrong(change(*measured()), start())
+    assert all(each.kind == "sign of the controls" for each in told)
     named = [k for k, name in enumerate(start().robot.joint_names) if any(name in warning for warning in told)]
     assert named == joints
+
+
+@pytest.mark.parametrize("what", ["q", "u", "q and u"])
+def test_swapped_columns_are_told(what):
+    order, (t, q, u) = [4, 1, 2, 3, 0, 5], measured()
+    log = vp.Log(t, q[:, order] if "q" in what else q, u[:, order] if "u" in what else u)
+    (told,) = wrong(log, start())
+    assert f"'shoulder_pan_joint' and 'wrist_2_joint' in {what} look swapped" in told
+
+
+@pytest.mark.parametrize("name", ["ur5", "kinova", "xarm7", "panda"])
+def test_no_right_log_is_told_to_be_wrong(name):
+    """Torques are those of Pinocchio for what the arm carries, on its way along waves, with friction and dampers."""
+    lock = {"lock": {"panda_finger_joint1": 0.0}} if name == "panda" else {}
+    robot = vp.load_robot(name, **lock)
+    scene = vp.Scene(robot, damping=0.0, friction=0.0)
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        carrying = vp.load_robot(name, payload=vp.Payload(robot.end_effector, rng.uniform(0.0, 3.0)), **lock).model
+        middle, phase = rng.uniform([[-2.0], [0.0]], [[2.0], [6.0]], (2, robot.dof))
+        rate, size = 2.0 * np.pi * rng.uniform(0.3, 1.2, robot.dof), rng.uniform(0.1, 0.4, robot.dof)
+        level, damping = rng.uniform(0.0, [[5.0], [3.0]], (2, robot.dof))
+        t = 1e-2 * np.arange(300)[:, None]
+        # A control acts until the next sample.
+        angle = rate * (t + 5e-3) + phase
+        v = size * rate * np.cos(angle)
+        at = map(robot.configuration, middle + size * np.sin(angle))
+        states = zip(at, v, -size * rate**2 * np.sin(angle), strict=True)
+        u = np.array([pin.rnea(carrying, carrying.createData(), *each) for each in states])
+        q = middle + size * np.sin(rate * t + phase) + NOISE * rng.standard_normal(u.shape)
+        assert not wrong(vp.Log(t[:, 0], q, u + level * np.sign(v) + damping * v), scene)
 
 
 @pytest.mark.parametrize("what", ["as it is", "named columns", "gaps", "an epoch's clock", "late torques"])

@@ -10,7 +10,7 @@ from ur5_logs import DAMPING, MIDDLE, NAMES, NOISE, TRUTH, motion, start
 
 import varpin as vp
 from varpin.estimation.consistency import Body
-from varpin.estimation.fit import simulations
+from varpin.estimation.fit import Stretch, simulations
 from varpin.estimation.parameters import parameters_of
 
 
@@ -235,6 +235,10 @@ def test_ctrl_c_after_the_search_keeps_its_values(monkeypatch):
     assert np.isfinite(found.residuals[0]).all()
     monkeypatch.setattr("varpin.estimation.fit.Run.settled", interrupted)
     np.testing.assert_array_equal(vp.identify(start(), log(), NAMES, q_noise=NOISE).values, found.values)
+    turned = log()
+    turned = vp.Log(turned.t, turned.q, turned.u * [1, 1, 1, -1, 1, 1])
+    found = vp.identify(start(), turned, NAMES, q_noise=NOISE, evaluations=5)
+    assert naming(found.warnings, "times q_noise", "column"), found.warnings
 
 
 @pytest.mark.parametrize("searches", [0, 1])
@@ -284,6 +288,21 @@ def test_dry_friction_leads_no_start_astray():
     )
     assert not found.warnings
     assert within(found, [0.5, 0.3, 0.3, 0.2])
+
+
+def test_steps_of_values_that_are_far_off_are_not_in_hundreds_of_parts(monkeypatch):
+    parts, whole = [], Stretch.motion
+
+    def counted(*given):
+        motion = whole(*given)
+        parts.append(0 if motion is None else motion.statistics.substeps.max(initial=1))
+        return motion
+
+    monkeypatch.setattr(Stretch, "motion", counted)
+    truth, begin = (vp.Scene(CHAIN, damping=damping) for damping in ([0.5, 0.3], 2e3))
+    found = vp.identify(begin, chain_log(truth), "damping", q_noise=1e-4, delay=0.0)
+    assert max(parts) <= 16
+    assert within(found, [0.5, 0.3])
 
 
 @pytest.mark.parametrize("begin", [(20.0, -1.0), (5.0, 0.0)])

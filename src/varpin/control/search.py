@@ -12,8 +12,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import replace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,7 +33,6 @@ from varpin.control.solution import Solution
 from varpin.control.stages import Cost, Rows, Steps, change, states
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, LinearizationError, StepError
-from varpin.integrators import Integrator
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.signals.commands import open_line, open_loop
@@ -469,7 +467,8 @@ class Search:
         step, noise, problem, motion = self.step, self.noise, self.problem, self.trajectory
         z = None if step.minimum is None else step.minimum.z
         shares, bad = noise_shares(problem, motion, noise), self._badness
-        integrator = self._in_bounds(motion)
+        # Steps of trials may not be halved much more often than those of the motion.
+        integrator = self.problem.integrator.halving(int(motion.statistics.halvings.max(initial=0)) + _HALVINGS)
 
         def attempt(length: float, feedforward: Floats = step.feedforward, z: Floats | None = z) -> Trial:
             commands = self._along_step(length, feedforward, z)
@@ -497,15 +496,6 @@ class Search:
         if taken.best.motion is not None and taken.best.shares is not None:
             self._move(taken.best.motion, taken.best.shares)
         return taken
-
-    def _in_bounds(self, motion: Trajectory) -> Integrator:
-        """The integrator of trials, whose steps may not be halved much more often than those of a motion."""
-        integrator: Any = self.problem.integrator
-        if getattr(integrator, "guard", None) is not None:
-            halvings = int(motion.statistics.halvings.max(initial=0)) + _HALVINGS
-            guard = replace(integrator.guard, max_halvings=min(integrator.guard.max_halvings, halvings))
-            integrator = replace(integrator, guard=guard)
-        return cast(Integrator, integrator)
 
     def _along_step(self, length: float, feedforward: Floats, z: Floats | None) -> Commands:
         """Commands of a length along a step with changes z, whose controls that it brings to a limit stay there."""

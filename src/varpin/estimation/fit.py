@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -37,12 +37,15 @@ _FIRST = 0.2
 # Expected decrease of the cost at which a first search ends, as a share of the cost, and the last one, as a share of
 # what one residual has in it: by a quarter of a deviation of a value. Where values are well told, the search is then
 # far closer, as it converges quadratically; inertias that logs hardly tell would go on for hundreds of evaluations.
-_LOOSE, _TIGHT = 1e-3, 0.05
+_LOOSE, _TIGHT = 0.01, 0.05
 # Most corrections of a stretch's start for given parameters, and the share of its cost below which it is found: later
 # evaluations go on from it.
 _CORRECTIONS, _FOUND = 6, 1e-8
 # Most trials of a correction, each a quarter as long: where dry friction turns, whole ones lead astray.
 _SHORTENED = 12
+# Most halvings of a step by a guard; from 3 to 5. Motions of values that are far off have steps of thousands of parts,
+# each with its derivatives, and are no nearer to the log.
+_HALVINGS = 4
 # Samples from which a stretch's start is guessed, by a parabola.
 _GUESSED = 8
 # Longest delay of the controls that is looked for [s]: buses and drives have some milliseconds.
@@ -73,6 +76,7 @@ class Fit:
     def __post_init__(self) -> None:
         if not self.horizon > 0.0:
             raise InputError(f"horizon must be positive [s], or np.inf for whole logs, got {self.horizon:g}")
+        self.integrator = self.integrator.halving(_HALVINGS)
         of, P, late = self.of, len(self.of.names), np.ones(int(self.delay is None))
         self.noise = of.scene.robot.joint_names, self.q_noise, self.v_noise
         self.bodies = _bodies(of)
@@ -183,8 +187,9 @@ class Run:
     def __post_init__(self) -> None:
         self.grid = Grid.even(self.log, self.fit.dt)
         self.duration = float(self.log.t[-1] - self.log.t[0])
-        self.measured, variance = measurements(self.log, *self.fit.noise)
+        samples, variance = measurements(self.log, *self.fit.noise)
         self.deviation = np.sqrt(variance)
+        self.measured = samples / self.deviation
 
     def settled(self, scene: Scene, late: float) -> list[Stretch]:
         """The stretches after a search for their starts, by shorter ones as :func:`identify` where none is known."""
@@ -210,9 +215,11 @@ class Stretch:
     """Steps ``begin`` to ``end`` of a run, and the samples on them."""
 
     def __init__(self, run: Run, begin: int, end: int) -> None:
-        self.run, self.begin, self.end = run, begin, end
-        node, last = run.grid.node, end == run.grid.steps
+        self.run, self.begin, self.end = run, begin, min(end, run.grid.steps)
+        node, last = run.grid.node, self.end == run.grid.steps
         self.samples = (node >= begin) & ((node < end) | last)
+        self.there = np.isfinite(run.measured[self.samples])
+        self.measured = run.measured[self.samples][self.there]
         if begin not in run.starts:
             run.starts[begin] = self._guess()
 
@@ -243,12 +250,6 @@ class Stretch:
         curve, at = CubicHermiteSpline(np.arange(len(q)), q, h * v), grid.at[self.samples] - self.begin
         return curve(at), curve(at, 1) / h
 
-    @cached_property
-    def measured(self) -> Floats:
-        """The samples that are there (r,), in units of their deviations."""
-        samples = (self.run.measured / self.run.deviation)[self.samples]
-        return samples[np.isfinite(samples)]
-
     @np.errstate(over="ignore", invalid="ignore")
     def residuals(
         self, scene: Scene, varied: Sequence[Varied], delay: float, x0: Floats
@@ -272,8 +273,7 @@ class Stretch:
             return None
         state = np.concatenate([motion.q, motion.v], axis=1)[:, :, None]
         both = np.concatenate(self.at_samples(*np.split(np.concatenate([state, x], axis=2), 2, axis=1)), axis=1)
-        there = np.isfinite(self.run.measured[self.samples])
-        rows = (both[:, : there.shape[1]] / self.run.deviation[:, None])[there]
+        rows = (both[:, : self.there.shape[1]] / self.run.deviation[:, None])[self.there]
         r, J = rows[:, 0] - self.measured, rows[:, 1:]
         return (r, J[:, :m], J[:, m:]) if np.isfinite(np.vdot(J, J) + r @ r) else None
 
@@ -289,15 +289,12 @@ class Stretch:
             gain = 2.0 * float(step @ (Jx.T @ r)) - float(np.square(Jx @ step).sum())
             if gain <= _FOUND * float(r @ r):
                 break
-            for _ in range(_SHORTENED):
-                trial = self.residuals(scene, (), late, x0 - step)
-                if trial is not None and trial[0] @ trial[0] < r @ r:
-                    break
-                step = 0.25 * step
-            else:
+            starts = (x0 - 0.25**k * step for k in range(_SHORTENED))
+            trials = ((start, self.residuals(scene, (), late, start)) for start in starts)
+            nearer = next((each for each in trials if each[1] and each[1][0] @ each[1][0] < r @ r), None)
+            if nearer is None:
                 break
-            assert trial is not None
-            x0, found = x0 - step, trial
+            x0, found = nearer
         found = self.residuals(scene, varied, late, x0)
         if found is None:
             return np.full(self.measured.size, LOST), np.zeros((self.measured.size, len(varied) + 1))

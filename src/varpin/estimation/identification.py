@@ -245,14 +245,14 @@ def _made(fit: Fit, y: Floats, runs: Sequence[Run], apart: Sequence[Run], status
     # Ctrl-C leaves out the motions and the check of the step that are not done, and keeps the values.
     every, known, of = [*runs, *apart], len(runs), fit.of
     predicted, before = ([np.full(run.log.q.shape, np.nan) for run in every] for _ in range(2))
-    changes = np.zeros(P)
+    changes, stretches = np.zeros(P), []
     try:
         for k, run in enumerate(every):
-            stretches = run.settled(scene, late)
-            predicted[k] = _positions(run, stretches, scene, late)
-            before[k] = _positions(run, stretches, fit.of.scene, 0.0 if fit.delay is None else fit.delay)
-        if status != "interrupted" and not fit.of.scene.processes:
-            changes = _step_error(fit, runs, y)
+            stretches.append(run.settled(scene, late))
+            predicted[k] = _positions(run, stretches[k], scene, late)
+            before[k] = _positions(run, stretches[k], of.scene, 0.0 if fit.delay is None else fit.delay)
+        if status != "interrupted" and not of.scene.processes:
+            changes = _step_error(fit, [part for parts in stretches[:known] for part in parts], y)
     except KeyboardInterrupt:
         status = "interrupted"
     residuals = [run.log.q - own for run, own in zip(every, predicted, strict=True)]
@@ -331,15 +331,15 @@ def _sentences(null: Floats, names: Sequence[str]) -> list[str]:
     return found
 
 
-def _step_error(fit: Fit, runs: Sequence[Run], y: Floats) -> Floats:
+def _step_error(fit: Fit, parts: Sequence[Stretch], y: Floats) -> Floats:
     """What half the step changes in the values (P,), to first order."""
-    finer = copy(fit)
+    finer, steps = copy(fit), []
     finer.dt *= 0.5
-    steps = []
-    scene = fit.of.scene_with(fit.values(y)[0])
-    for each, of in ((fit, runs), (finer, [Run(finer, run.log) for run in runs])):
-        r, J = simulations(each, [part for run in of for part in run.settled(scene, fit.late(y))], y)
-        both, slopes = fit.with_prior(r, J, y)
+    runs = {part.run for part in parts}
+    halved = {run: Run(finer, run.log, {2 * at: start for at, start in run.starts.items()}) for run in runs}
+    again = [Stretch(halved[part.run], 2 * part.begin, 2 * part.end) for part in parts]
+    for each, stretches in ((fit, parts), (finer, again)):
+        both, slopes = fit.with_prior(*simulations(each, stretches, y), y)
         steps.append(np.linalg.lstsq(slopes, both, rcond=_NOTHING)[0])
     change: Floats = fit.values(y)[1] @ (steps[0] - steps[1])
     return change[: len(fit.of.names)]
@@ -347,10 +347,10 @@ def _step_error(fit: Fit, runs: Sequence[Run], y: Floats) -> Floats:
 
 def _doubts(fit: Fit, made: Identification, changes: Floats) -> Iterator[Finding]:
     """What is doubtful about the values, the worst first; ``changes`` (P,) are those by half the step."""
+    misfits = list(_misfit(fit, made))
     if fit.cost >= LOST**2:
         text = "motions with these values cannot be simulated: a column or its unit is wrong, or dt is too long"
-        yield Finding("lost", text)
-    misfits = list(_misfit(fit, made))
+        misfits = [Finding("lost", text)]
     yield from misfits
     by_noise = np.divide(np.abs(changes), made.deviations, out=np.zeros_like(changes), where=made.deviations > 0.0)
     k = int(np.argmax(by_noise))
@@ -386,13 +386,17 @@ def _misfit(fit: Fit, made: Identification) -> Iterator[Finding]:
     there = np.isfinite(squares)
     by_joint = np.sqrt(np.where(there, squares, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1))
     worst = int(np.argmax(by_joint))
-    if not by_joint[worst] <= _MISFIT:
-        joint = fit.of.scene.robot.joint_names[worst]
+    over, joint = float(by_joint[worst]), fit.of.scene.robot.joint_names[worst]
+    whose = f" of {joint!r}"
+    if not there.any():
+        # Ctrl-C came before the motions over the horizon: those of the search tell.
+        over, whose = float(np.sqrt(fit.cost / len(fit.jacobian))), ""
+    if not over <= _MISFIT:
         text = (
-            f"the residuals of {joint!r} are {by_joint[worst]:.3g} times q_noise: something acts that is no "
-            "parameter (friction, a payload elsewhere), or its column, clock or q_noise is wrong"
+            f"the residuals{whose} are {over:.3g} times q_noise: something acts that is no parameter (friction, a "
+            "payload elsewhere), or its column, clock or q_noise is wrong"
         )
-        yield Finding("misfit", text, joint, value=float(by_joint[worst]))
+        yield Finding("misfit", text, joint if whose else None, value=over)
 
 
 def _ended(fit: Fit) -> list[str]:

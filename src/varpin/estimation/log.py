@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +35,10 @@ _BEYOND = 0.1
 # Length [s] of the parabolas that tell the forces of a log, and the fewest samples of one, and parabolas, that do. The
 # noise of encoders spoils shorter ones, and what arms do within longer ones is lost.
 _PARABOLA, _FEW = 0.2, 4
-# Share of the squared forces that a scene lacks with the controls of a log, below which those that it lacks with the
-# opposite ones tell that these are right: drives that give a third to three times the torque they tell, the other way.
-_OPPOSITE = 0.25
+# Share of the squared forces of a joint that a scene lacks with a log, below which those that it lacks with opposite
+# controls or exchanged columns tell that these are right; from 0.1 to 0.5. Payloads and friction that no scene has
+# leave 0.9 and more.
+_FITS = 0.25
 # Fewest samples of a joint: fewer tell no velocity.
 _LEAST = 2
 # The arrays of a log in files, of which the first three must be there.
@@ -218,12 +220,7 @@ def _doubts(scene: Scene, t: Floats, q: Floats, u: Floats) -> Iterator[Finding]:
         unit = joint_unit(scene.robot, far)
         text = f"q of {names[far]!r} is {beyond[far]:.3g} {unit} beyond its limits: columns may be in another order"
         yield Finding("log beyond limits", text, names[far], value=float(beyond[far]), unit=unit)
-    if turned := _opposite(scene, t, q, u):
-        of = ", ".join(map(repr, turned))
-        text = (
-            f"u of {of} fits q far better with the opposite sign: turn u, q or the scene's gravity, whichever is wrong"
-        )
-        yield Finding("sign of the controls", text)
+    yield from _confused(scene, t, q, u)
     still, driven = most == least, (scene.actuation != 0.0) @ (np.ptp(u, axis=0) > 0.0)
     # An encoder that reads one number to the last bit while a control that changes acts on its joint.
     for joint in np.flatnonzero(still & driven & (not still.all())):
@@ -234,21 +231,43 @@ def _doubts(scene: Scene, t: Floats, q: Floats, u: Floats) -> Iterator[Finding]:
         yield Finding("gap in the log", text, time=float(t[at]), value=float(steps[at]), unit="s")
 
 
-def _opposite(scene: Scene, t: Floats, q: Floats, u: Floats) -> list[str]:
-    """The joints that move as if their controls had the opposite sign, by inverse dynamics of parabolas."""
+def _confused(scene: Scene, t: Floats, q: Floats, u: Floats) -> Iterator[Finding]:
+    """Signs of controls or two columns that look wrong, whichever it is, by inverse dynamics of parabolas."""
     rows, k = np.flatnonzero(np.isfinite(q).all(axis=1)), round(_PARABOLA / float(np.median(np.diff(t))))
     if k < _FEW or len(rows) < _FEW * k:
-        return []
+        return
     at = rows[: len(rows) // k * k].reshape(-1, k)
     s = t[at] - t[at].mean(axis=1, keepdims=True)
     parabolas = np.linalg.pinv(np.stack([np.ones_like(s), s, 0.5 * s**2], axis=2)) @ q[at]
-    place, v, a = parabolas.swapaxes(0, 1)
-    needed, force = inverse_dynamics(scene.core, place, v, a), u[at].mean(axis=1) @ scene.actuation.T
-    # Friction and dampers that the scene does not have, of any size, tell nothing.
-    passive = np.linalg.qr(np.array([np.sign(v), v]).T)[0]
-    off = np.array([needed - own - scene.core.forces(place, v, own)[0] for own in (force, -force)]).T
-    told, turned = np.square(off - passive @ (passive.swapaxes(1, 2) @ off)).sum(axis=1).T
-    return [name for name, wrong in zip(scene.robot.joint_names, turned < _OPPOSITE * told, strict=True) if wrong]
+    motion, force = parabolas.swapaxes(0, 1), u[at].mean(axis=1) @ scene.actuation.T
+
+    def lacking(motion: Floats, force: Floats) -> Floats:
+        """Logarithms (n,) of the squared forces that the scene lacks."""
+        q, v, a = motion
+        off = (inverse_dynamics(scene.core, q, v, a) - force - scene.core.forces(q, v, force)[0]).T[:, :, None]
+        # Friction and dampers that the scene does not have, of any size, tell nothing.
+        passive = np.linalg.qr(np.array([np.sign(v), v]).T)[0]
+        left = np.square(off - passive @ (passive.swapaxes(1, 2) @ off)).sum(axis=(1, 2))
+        return np.asarray(np.log(np.maximum(left, np.finfo(float).tiny)))
+
+    names, own, least = scene.robot.joint_names, lacking(motion, force), np.log(_FITS)
+    gains = lacking(motion, -force) - own
+    turned = np.flatnonzero(gains < least)
+    best, kind = gains[turned].sum(), "sign of the controls"
+    of = ", ".join(repr(names[joint]) for joint in turned)
+    text = f"u of {of} fits q far better with the opposite sign: turn u, q or the scene's gravity, whichever is wrong"
+    for pair in map(list, combinations(range(len(names)), 2)):
+        order = np.arange(len(names))
+        order[pair] = pair[::-1]
+        moved, other = motion[:, :, order], force[:, order]
+        for what, *given in (("q", moved, force), ("u", motion, other), ("q and u", moved, other)):
+            gains = lacking(*given) - own
+            if gains[pair].max() < least and gains.sum() < best:
+                best, kind = gains.sum(), "order of the columns"
+                of = " and ".join(repr(names[joint]) for joint in pair)
+                text = f"the columns of {of} in {what} look swapped: the log fits far better with them exchanged"
+    if best < 0.0:
+        yield Finding(kind, text)
 
 
 def _from_csv(source: Path) -> dict[str, Any]:

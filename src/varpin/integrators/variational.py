@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -100,6 +100,13 @@ class Variational(Integrator):
             raise InputError(f"guard must be a varpin.Guard, or None for no guards, got {self.guard!r}")
         positive("tolerance", self.tolerance, "rounding units")
         word("kick", self.kick, ("left", "split", "held"))
+
+    def halving(self, most: int) -> Self:
+        if self.guard is None:
+            return self
+        own: Any = self  # a dataclass, as all that are made
+        made: Self = replace(own, guard=replace(self.guard, max_halvings=min(self.guard.max_halvings, most)))
+        return made
 
     def damped(self, z: Floats) -> tuple[Floats, Floats]:
         _, a, b, c, *_ = self.scheme

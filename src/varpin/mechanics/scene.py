@@ -241,8 +241,8 @@ class Scene(Frozen):
         """The joints that have to be computed, and those that stay at rest: ``scene.without(required.idle)``.
 
         A group of joints that shares no inertia with others is idle if it starts at rest, and no gravity, spring, noise
-        or control acts on it, nor a task. The motion of the other joints is the same without it. A robot whose joints are
-        all idle keeps them: it has no motion without any.
+        or control acts on it, nor a task. The motion of the other joints is the same without it. Of combined robots,
+        one whose joints are all idle keeps them.
 
         Args:
             q0: Initial configuration, (n,) or by joint name [rad or m].
