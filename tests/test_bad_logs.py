@@ -66,7 +66,7 @@ def test_what_does_not_fit_is_told_first(what):
 
 def wrong(log, scene):
     """What is told of the order and the signs of columns."""
-    kinds = "sign of the controls", "order of the columns"
+    kinds = "sign of the columns", "order of the columns"
     return [each for each in log.matched(scene).warnings if each.kind in kinds]
 
 
@@ -76,6 +76,7 @@ TURNED = {
     "torques of a joint": ([0], lambda t, q, u: vp.Log(t, q, u * [-1, 1, 1, 1, 1, 1])),
     "torques of another": ([5], lambda t, q, u: vp.Log(t, q, u * [1, 1, 1, 1, 1, -1])),
     "an encoder": ([2], lambda t, q, u: vp.Log(t, q * [1, 1, -1, 1, 1, 1], u)),
+    "another encoder": ([1], lambda t, q, u: vp.Log(t, q * [1, -1, 1, 1, 1, 1], u)),
     "none": ([], vp.Log),
     "none, but friction": ([], lambda t, q, u: vp.Log(t, q, u + 9.0 * np.sign(np.gradient(q, axis=0)))),
     "none, and strong drives": ([], lambda t, q, u: vp.Log(t, q, 0.5 * u)),
@@ -86,7 +87,7 @@ TURNED = {
 def test_turned_signs_are_told(what):
     joints, change = TURNED[what]
     told = wrong(change(*measured()), start())
-    assert all(each.kind == "sign of the controls" for each in told)
+    assert all(each.kind == "sign of the columns" for each in told)
     named = [k for k, name in enumerate(start().robot.joint_names) if any(name in warning for warning in told)]
     assert named == joints
 

@@ -232,7 +232,7 @@ def _doubts(scene: Scene, t: Floats, q: Floats, u: Floats) -> Iterator[Finding]:
 
 
 def _confused(scene: Scene, t: Floats, q: Floats, u: Floats) -> Iterator[Finding]:
-    """Signs of controls or two columns that look wrong, whichever it is, by inverse dynamics of parabolas."""
+    """The signs or two columns that look wrong, whichever it is, by inverse dynamics of parabolas."""
     rows, k = np.flatnonzero(np.isfinite(q).all(axis=1)), round(_PARABOLA / float(np.median(np.diff(t))))
     if k < _FEW or len(rows) < _FEW * k:
         return
@@ -253,9 +253,14 @@ def _confused(scene: Scene, t: Floats, q: Floats, u: Floats) -> Iterator[Finding
     names, own, least = scene.robot.joint_names, lacking(motion, force), np.log(_FITS)
     gains = lacking(motion, -force) - own
     turned = np.flatnonzero(gains < least)
-    best, kind = gains[turned].sum(), "sign of the controls"
+    best, kind = gains[turned].sum(), "sign of the columns"
     of = ", ".join(repr(names[joint]) for joint in turned)
     text = f"u of {of} fits q far better with the opposite sign: turn u, q or the scene's gravity, whichever is wrong"
+    for joint, name in enumerate(names):
+        gains = lacking(motion * np.where(np.arange(len(names)) == joint, -1.0, 1.0), force) - own
+        if gains[joint] < least and gains.sum() < best:
+            best, kind = gains.sum(), "sign of the columns"
+            text = f"q of {name!r} fits u far better with the opposite sign: turn q or u, whichever is wrong"
     for pair in map(list, combinations(range(len(names)), 2)):
         order = np.arange(len(names))
         order[pair] = pair[::-1]
