@@ -290,6 +290,12 @@ def test_dry_friction_leads_no_start_astray():
     assert within(found, [0.5, 0.3, 0.3, 0.2])
 
 
+def test_sharp_friction_is_found():
+    truth, begin = (vp.Scene(CHAIN, damping=0.3, forces=vp.CoulombFriction(level, 3e-4)) for level in ([1.0, 0.6], 0.3))
+    found = vp.identify(begin, chain_log(truth), "friction", q_noise=1e-4, delay=0.0)
+    assert found.values == pytest.approx([1.0, 0.6], rel=0.02)
+
+
 def test_steps_of_values_that_are_far_off_are_not_in_hundreds_of_parts(monkeypatch):
     parts, whole = [], Stretch.motion
 

@@ -160,7 +160,8 @@ class Mpc:
     nodes, and in the middles of steps with ``between_nodes`` or linear controls. A goal (:class:`ReachFrame`) applies
     to the end of every horizon. The size of a margin is that of the first plan.
 
-    An ``unstable loop`` is told of by the feedback of most plans, not where plans jump from tick to tick.
+    The warning ``unstable loop`` is from the plans' feedback; with linear controls there is none for plans that are older
+    than a tick or have costs or limits of changes of the controls.
 
     Main args:
         problem: The problem. Its horizon, discretization, noise, limits and constraints apply to every tick, its
@@ -304,7 +305,8 @@ class Mpc:
                 raise CostError(cause.cost, cause.problem, loop.told(error.trajectory)) from cause
             raise cause or error from None
         except StepFailure as error:
-            raise error.along(loop.told(error.trajectory), "Use more Plant(substeps=)") from None
+            rings = Case(scene, method, error.trajectory, restart=plant.substeps).rings
+            raise error.along(loop.told(error.trajectory), rings or "Use more Plant(substeps=)") from None
         except Interrupted as error:
             error.trajectory = loop.told(error.trajectory)
             raise
@@ -516,14 +518,15 @@ def _lines(plan: Solution) -> int:
 def _feedback(tick: _Tick) -> tuple[Floats, Floats]:
     """The gains of a tick, (m, 2n) or (m, 2n + m), and the configuration (n,) that they are about.
 
-    Those of a line are of its mean, to whose two ends a fresh plan reacts. Lines of older plans count as none.
+    Those of a line are of its mean, to whose two ends a fresh plan reacts. Lines of older plans, and those that remember
+    the control before, count as none.
     """
     plan, age, *_ = tick
     policy, row = plan.policy, min(age, _lines(plan) - 1)
     gains, begin = policy.feedback[row], plan.gains[0]
     if policy.linear:
         end, kept = np.split(policy.feedback[0], [begin.shape[1]], axis=1)
-        gains = 0.5 * (age == 0) * (begin + end + kept @ begin)
+        gains = 0.5 * (age == 0 and not plan.problem.remembers) * (begin + end + kept @ begin)
     return gains, policy.reference[row, : plan.problem.scene.robot.dof]
 
 

@@ -43,9 +43,9 @@ _LOOSE, _TIGHT = 0.01, 0.05
 _CORRECTIONS, _FOUND = 6, 1e-8
 # Most trials of a correction, each a quarter as long: where dry friction turns, whole ones lead astray.
 _SHORTENED = 12
-# Most halvings of a step by a guard; from 3 to 5. Motions of values that are far off have steps of thousands of parts,
-# each with its derivatives, and are no nearer to the log.
-_HALVINGS = 4
+# Most halvings of a step by a guard, without forces that turn within a step, as dry friction does; from 3 to 5. Motions of
+# values that are far off have steps of thousands of parts, each with its derivatives, and are no nearer to the log.
+_HALVINGS, _STEADY = 4, ("JointSpring", "JointDamper")
 # Samples from which a stretch's start is guessed, by a parabola.
 _GUESSED = 8
 # Longest delay of the controls that is looked for [s]: buses and drives have some milliseconds.
@@ -76,8 +76,10 @@ class Fit:
     def __post_init__(self) -> None:
         if not self.horizon > 0.0:
             raise InputError(f"horizon must be positive [s], or np.inf for whole logs, got {self.horizon:g}")
-        self.integrator = self.integrator.halving(_HALVINGS)
         of, P, late = self.of, len(self.of.names), np.ones(int(self.delay is None))
+        dry = any(name.startswith("friction") for name in of.names)
+        if not dry and all(element.kind in _STEADY for element in of.scene.elements):
+            self.integrator = self.integrator.halving(_HALVINGS)
         self.noise = of.scene.robot.joint_names, self.q_noise, self.v_noise
         self.bodies = _bodies(of)
         self.prior = [c for columns, _ in self.bodies for c in columns]

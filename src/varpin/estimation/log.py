@@ -39,6 +39,8 @@ _PARABOLA, _FEW = 0.2, 4
 # controls or exchanged columns tell that these are right; from 0.1 to 0.5. Payloads and friction that no scene has
 # leave 0.9 and more.
 _FITS = 0.25
+# Most joints whose columns may be turned or exchanged: of more, pairs take seconds.
+_SUSPECTS = 8
 # Fewest samples of a joint: fewer tell no velocity.
 _LEAST = 2
 # The arrays of a log in files, of which the first three must be there.
@@ -256,12 +258,14 @@ def _confused(scene: Scene, t: Floats, q: Floats, u: Floats) -> Iterator[Finding
     best, kind = gains[turned].sum(), "sign of the columns"
     of = ", ".join(repr(names[joint]) for joint in turned)
     text = f"u of {of} fits q far better with the opposite sign: turn u, q or the scene's gravity, whichever is wrong"
-    for joint, name in enumerate(names):
-        gains = lacking(motion * np.where(np.arange(len(names)) == joint, -1.0, 1.0), force) - own
-        if gains[joint] < least and gains.sum() < best:
+    # The joints whose forces explain the least of what they need.
+    suspects = sorted(np.argsort(lacking(motion, 0.0 * force) - own)[:_SUSPECTS])
+    for joint in suspects:
+        name, gains = names[joint], lacking(motion * np.where(np.arange(len(names)) == joint, -1.0, 1.0), force) - own
+        if gains[joint] < least and gains.sum() < min(best, least):
             best, kind = gains.sum(), "sign of the columns"
             text = f"q of {name!r} fits u far better with the opposite sign: turn q or u, whichever is wrong"
-    for pair in map(list, combinations(range(len(names)), 2)):
+    for pair in map(list, combinations(suspects, 2)):
         order = np.arange(len(names))
         order[pair] = pair[::-1]
         moved, other = motion[:, :, order], force[:, order]

@@ -55,7 +55,7 @@ class Guard:
         energy_budget: Largest sum of these errors over all substeps, relative to the largest kinetic energy so far
             (plus the work done by forces). The closer the sum is to the budget, the smaller the errors of the same sign
             that are accepted.
-        max_halvings: Most halvings of a step, at most 30. A step has at most 256 parts, however short.
+        max_halvings: Most halvings of a step, at most 30. A step has at most 1024 parts, however short.
 
     Raises:
         InputError: A value is out of its range.

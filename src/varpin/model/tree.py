@@ -115,6 +115,7 @@ def frame_of(model: pin.Model, name: str, robot: str) -> pin.Frame:
     """The frame of a name: the link's where a joint that may be elsewhere has the same."""
     found = [frame for frame in model.frames if frame.name == name] if isinstance(name, str) else []
     if not found:
+        # Frames of tools come last.
         raise UnknownFrame(str(name), [frame.name for frame in reversed(model.frames)], f"robot {robot!r} has no frame")
     return next((frame for frame in found if frame.type == pin.FrameType.BODY), found[0])
 

@@ -273,7 +273,7 @@ class Case:
         """What the caller gives for shorter steps, in words."""
         return "more Plant(substeps=)" if self.restart else "a smaller dt"
 
-    @property
+    @functools.cached_property
     def rings(self) -> str:
         """The advice where the integrator rings, or runs away, as damping is faster than the step; else empty."""
         scene, motion, most = self.scene, self.trajectory, _RINGS / self.trajectory.dt

@@ -63,7 +63,7 @@ class StepFailure(VarpinError, RuntimeError):
         residual: The last residual, in units of the rounding error of its terms.
         reason: What stopped the last attempt.
         problem: The step and the reason, in words.
-        advice: The cause if one is known, as an unstable control loop, or what to try.
+        advice: An unstable control loop if there is one, else the cause or what to try.
         q: Configuration at the start of the step (n,) [rad or m].
         v: Velocity there (n,).
         p: Momentum there (n,).
@@ -81,7 +81,8 @@ class StepFailure(VarpinError, RuntimeError):
         self.trajectory = trajectory
         self.advice = next((found for found in trajectory.warnings if found.kind == "unstable loop"), advice)
         self.problem = f"step {step} (t = {time:.6g} s) failed: {failure.reason}"
-        super().__init__(f"{self.problem}. {self.advice}. The motion so far is in error.trajectory")
+        advice = str(self.advice)
+        super().__init__(f"{self.problem}. {advice[:1].upper()}{advice[1:]}. The motion so far is in error.trajectory")
 
     def along(self, trajectory: Trajectory, advice: str) -> StepFailure:
         """The same failure with the motion's warnings, and with what its caller may try."""
