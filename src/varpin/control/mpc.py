@@ -160,8 +160,8 @@ class Mpc:
     nodes, and in the middles of steps with ``between_nodes`` or linear controls. A goal (:class:`ReachFrame`) applies
     to the end of every horizon. The size of a margin is that of the first plan.
 
-    The warning ``unstable loop`` is from the plans' feedback; with linear controls there is none for plans that are older
-    than a tick or have costs or limits of changes of the controls.
+    The warning ``unstable loop`` is from the plans' feedback. With linear controls there is none for plans that are
+    older than a tick, or that have costs or limits of changes of the controls.
 
     Main args:
         problem: The problem. Its horizon, discretization, noise, limits and constraints apply to every tick, its
@@ -518,8 +518,8 @@ def _lines(plan: Solution) -> int:
 def _feedback(tick: _Tick) -> tuple[Floats, Floats]:
     """The gains of a tick, (m, 2n) or (m, 2n + m), and the configuration (n,) that they are about.
 
-    Those of a line are of its mean, to whose two ends a fresh plan reacts. Lines of older plans, and those that remember
-    the control before, count as none.
+    Those of a line are of its mean, to whose two ends a fresh plan reacts. Lines of older plans, and those that
+    remember the control before, count as none.
     """
     plan, age, *_ = tick
     policy, row = plan.policy, min(age, _lines(plan) - 1)

@@ -43,8 +43,8 @@ _LOOSE, _TIGHT = 0.01, 0.05
 _CORRECTIONS, _FOUND = 6, 1e-8
 # Most trials of a correction, each a quarter as long: where dry friction turns, whole ones lead astray.
 _SHORTENED = 12
-# Most halvings of a step by a guard, without forces that turn within a step, as dry friction does; from 3 to 5. Motions of
-# values that are far off have steps of thousands of parts, each with its derivatives, and are no nearer to the log.
+# Most halvings of a step by a guard, without forces that turn within a step, as dry friction does; from 3 to 5. Motions
+# of values that are far off have steps of thousands of parts, each with its derivatives, and are no nearer to the log.
 _HALVINGS, _STEADY = 4, ("JointSpring", "JointDamper")
 # Samples from which a stretch's start is guessed, by a parabola.
 _GUESSED = 8

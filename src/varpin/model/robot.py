@@ -241,8 +241,10 @@ class Robot(Frozen):
         places, axis = np.array([frame.placement.translation for frame in frames]), joint_axis(model, last)[1]
         out = np.abs(places @ axis)
         out[np.linalg.norm(np.cross(places, axis), axis=1) > _ASIDE] = 0.0
-        names = [frames[k].name for k in np.flatnonzero(out > out.max() - _ASIDE)]
-        return ([name for name in names if _TOOL.search(name)] or names)[-1]
+        far = [frames[k] for k in np.flatnonzero(out > out.max() - _ASIDE)]
+        # Names of fixed joints are not those of their links: "tool_cam" moves a camera.
+        tools = [frame for frame in far if frame.type != pin.FrameType.FIXED_JOINT and _TOOL.search(frame.name)]
+        return str((tools or far)[-1].name)
 
     def frame_positions(self, q: ArrayLike, frame: str | None = None) -> Floats:
         """World positions (..., 3) [m] of a frame, or of :attr:`end_effector`, at ``q`` (..., n).

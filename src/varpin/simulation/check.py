@@ -111,7 +111,7 @@ class Case:
         (q, v), share = again, abs(1.0 - self.closer[2])
         return np.abs(q - self.trajectory.q) / share, np.abs(v - self.trajectory.v) / share
 
-    def repeated(self, shift: float = 0.0) -> tuple[Floats, Floats]:
+    def repetition(self, shift: float = 0.0) -> tuple[Floats, Floats]:
         """Q and v (N + 1, n) of the repetition, NaN where it failed, from a start that is off by ``shift``."""
         scene, trajectory, hold, law = self.scene, self.trajectory, self.hold, self.law and self.law()
         method, parts, _ = self.closer
@@ -384,16 +384,16 @@ def check(case: Case, known: Floats | None = None) -> Trajectory:
     alone = resolved and not (held_mean or calls or case.hold)
     proven = proven_error(scene, integrator, trajectory) if alone else None
     if proven is not None:
-        motion = trajectory.with_error(lambda: case.errors(case.repeated())[0], proven)
+        motion = trajectory.with_error(lambda: case.errors(case.repetition())[0], proven)
         return motion.changed(warnings=tuple(limits))
 
     try:
-        again = case.repeated()
+        again = case.repetition()
         off, speed_off = case.errors(again)
 
         def rounded() -> Floats:
             last_digit = float(np.spacing(max(1.0, np.abs(trajectory.q[0]).max())))
-            return np.abs(case.repeated(math.sqrt(trajectory.steps) * last_digit)[0] - again[0])
+            return np.abs(case.repetition(math.sqrt(trajectory.steps) * last_digit)[0] - again[0])
 
         found = case.findings(off, speed_off, rounded) or case.short_forces()
     except (CustomForceError, CustomConstraintError) as error:

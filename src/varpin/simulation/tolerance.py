@@ -98,10 +98,10 @@ class Trial:
     measured: bool = True
 
 
-def repeated(case: Case, cost: float) -> tuple[Trial, Floats]:
+def trial_of(case: Case, cost: float) -> tuple[Trial, Floats]:
     """A motion as a trial, and its error (N + 1, n), from its repetition."""
     motion = case.trajectory
-    off, _ = case.errors(case.repeated())
+    off, _ = case.errors(case.repetition())
     largest = max(float(off.max()), ROUNDING * max(1.0, float(np.abs(motion.q).max())))
     whole = motion.statistics.split_steps == 0
     return Trial(case.integrator, motion.steps, largest if math.isfinite(largest) else math.inf, cost, whole), off
@@ -342,7 +342,7 @@ class _Search:
             case = Case(self.scene, integrator, motion, controls)
             if case.short_forces():
                 return Trial(integrator, steps, math.inf, float(work))
-            trial, self.errors[str(integrator), steps] = repeated(case, float(work))
+            trial, self.errors[str(integrator), steps] = trial_of(case, float(work))
             # Each step of a repetition takes about twice the evaluations.
             parts = case.closer[1]
             self.steps, self.evaluations = self.steps + parts * steps, self.evaluations + 2 * parts * int(work)

@@ -15,7 +15,7 @@ from varpin.errors import InputError
 from varpin.integrators import Integrator, Reference
 from varpin.mechanics.scene import Scene
 from varpin.simulation.check import Case
-from varpin.simulation.tolerance import Ladder, Trial, first_steps, repeated
+from varpin.simulation.tolerance import Ladder, Trial, first_steps, trial_of
 from varpin.study.motion import Setting, integrators_of
 from varpin.study.record import Study
 from varpin.support.checks import JointValues, positive
@@ -170,7 +170,7 @@ def _timed(setting: Setting, integrator: Integrator, steps: int) -> Trial:
     outcome = setting.run(integrator, steps, repeats=_REPEATS, within=_TIMING)
     if outcome.failure:
         return Trial(integrator, steps, math.inf, outcome.seconds)
-    return repeated(Case(setting.scene, integrator, outcome.motion), outcome.seconds)[0]
+    return trial_of(Case(setting.scene, integrator, outcome.motion), outcome.seconds)[0]
 
 
 def _reason(
