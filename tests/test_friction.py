@@ -364,3 +364,11 @@ def test_smooth_commands_of_a_servo_of_100_hertz_take_whole_steps(load, integrat
     options = {"dt": 5e-3, "steps": 200, "controls": commands, "integrator": integrator}
     work = vp.simulate(scene, START, np.zeros(6), **options).statistics
     assert (work.split_steps, work.substeps.max()) == (0, 1)
+
+
+def test_a_step_may_need_hundreds_of_parts():
+    robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.0})
+    scene = vp.Scene(robot, forces=vp.CoulombFriction(3.0, 1e-4), damping=0.0)
+    q0, v0 = np.linspace(-1.0, 1.0, robot.dof), np.zeros(robot.dof)
+    motion = vp.simulate(scene, q0, v0, dt=0.02, steps=50, integrator=vp.Midpoint())
+    assert motion.statistics.substeps.max() > 256
