@@ -450,3 +450,9 @@ def test_an_assembly_that_cannot_be_names_a_place_nearby(constraint):
         vp.assemble(vp.Scene(vp.planar_chain(3), constraints=constraint), [0.3, 0.4, 0.2])
     assert np.abs(info.value.q).max() < 10.0
     assert info.value.miss < 3.8
+
+
+def test_a_wrong_jacobian_is_named_where_steps_fail():
+    wrong = vp.CustomConstraint(1, lambda q: [np.sin(q[0]) + q[1] - 0.3], lambda q: [[-np.cos(q[0]), -1.0]])
+    with refused(vp.StepFailure, "CustomConstraint", "derivatives are wrong"):
+        vp.simulate(vp.Scene(vp.planar_chain(2), constraints=[wrong]), [0.0, 0.3], [0.0, 0.0], dt=1e-2, steps=20)

@@ -8,6 +8,7 @@ import numpy as np
 
 from varpin.errors import StepError, VarpinError
 from varpin.integrators.base import Failure
+from varpin.mechanics.constraints import CustomConstraint
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
 
@@ -90,8 +91,10 @@ class StepFailure(VarpinError, RuntimeError):
 
 
 def named(scene: Scene, failure: Failure) -> Failure:
-    """The failure with the scene's CustomForce functions named as a possible reason."""
-    if scene.custom is None:
+    """The failure with the scene's own functions of forces and constraints named as a possible reason."""
+    own = [] if scene.custom is None else [f"CustomForce {scene.custom.names}"]
+    own += ["a CustomConstraint"] * any(isinstance(each, CustomConstraint) for each in scene.constraints)
+    if not own:
         return failure
-    what = f"CustomForce {scene.custom.names} may be the reason, where it jumps or its derivatives are wrong"
+    what = f"{' or '.join(own)} may be the reason, where it jumps or its derivatives are wrong"
     return replace(failure, reason=f"{failure.reason} ({what})")
